@@ -1,0 +1,1 @@
+"""Where the cameras are: the rig itself, how it is found, and how staleness is noticed."""

@@ -1,0 +1,44 @@
+"""The `station` command: the table of what an operator can do."""
+
+from __future__ import annotations
+
+import click
+
+from station import __version__
+from station.lazy_group import LazyGroup, run
+
+COMMANDS = {
+    "run": ("station.supervisor:run", "run the whole booth in the foreground"),
+    "start": ("station.operator_cli:start", "start the sensors"),
+    "scan": ("station.operator_cli:scan", "scan the person in the booth"),
+    "status": ("station.operator_cli:status", "show cameras, scans and workers"),
+    "stop": ("station.operator_cli:stop", "stop the sensors"),
+    "calibrate": ("station.calibration.cli:calibrate", "find where the cameras are"),
+    "check": ("station.calibration.cli:check", "check that no camera has moved"),
+    "purge": ("station.retention:purge", "delete a scan and its results"),
+    "capture": ("station.capture:capture", "one camera's capture process"),
+    "sync": ("station.sync:sync", "the sync-and-merge process"),
+    "control": ("station.control:control", "the operator's endpoint"),
+    "record-virtual": ("station.drivers.virtual_cli:record_virtual", "record a virtual person"),
+}
+
+
+@click.group(cls=LazyGroup, lazy=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+def station() -> None:
+    """Run the body-scanning booth: four depth cameras, one scan, one body.
+
+    \b
+    Examples:
+      station run --config booth.toml        all processes, supervised
+      station scan --label "Order 1234"      scan the person in the booth
+      station status                         what every camera and scan is doing
+    """
+
+
+def main() -> None:
+    run(station)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The `reconstruct` command: the table of what turns bundles into bodies."""
+
+from __future__ import annotations
+
+import click
+
+from station import __version__
+from station.lazy_group import LazyGroup, run
+
+COMMANDS = {
+    "fit": ("workers.fit_cli:fit", "reconstruct one scan bundle or point cloud"),
+    "work": ("workers.pool:work", "serve the spool's queue"),
+    "measure": ("workers.measure.cli:measure", "measure a result or a mesh"),
+    "train": ("workers.scape.cli:train", "learn the body model from a database"),
+    "evaluate-model": ("workers.scape.cli:evaluate_model", "test the model on held-out bodies"),
+}
+
+
+@click.group(cls=LazyGroup, lazy=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+def reconstruct() -> None:
+    """Turn scan bundles into measured bodies.
+
+    \b
+    Examples:
+      reconstruct fit spool/queue/20261121T100000Z-7f3a --out result
+      reconstruct measure result
+      reconstruct work --config booth.toml
+    """
+
+
+def main() -> None:
+    run(reconstruct)
+
+
+if __name__ == "__main__":
+    main()

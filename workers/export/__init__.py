@@ -1,0 +1,1 @@
+"""Files that a fitting room opens: meshes, pictures, tables."""

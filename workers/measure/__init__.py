@@ -1,0 +1,1 @@
+"""Tailor's measurements: landmarks, girths, lengths and the table that defines them."""
