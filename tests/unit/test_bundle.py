@@ -1,0 +1,113 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.bundle import CapturedFrame, read_bundle, write_bundle
+from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
+from station.errors import BundleError, CalibrationError, FormatError
+
+
+@pytest.fixture
+def bundle_folder(tmp_path: Path) -> Path:
+    camera = CameraCalibration(
+        name="front",
+        serial="A001",
+        model="kinect-v1",
+        width=64,
+        height=48,
+        K=np.array([[58.0, 0.0, 32.0], [0.0, 58.0, 24.0], [0.0, 0.0, 1.0]]),
+        distortion=np.zeros(5),
+        depth_correction=DepthCorrection(),
+        world_from_camera=np.eye(4),
+    )
+    rng = np.random.default_rng(0)
+    frames = [
+        CapturedFrame(rng.integers(0, 40_000, (48, 64), dtype=np.uint16), 7 * i, 60e6, 0.1 * i, i)
+        for i in range(3)
+    ]
+    folder = tmp_path / "scan"
+    write_bundle(
+        folder,
+        scan_id="20261121T100000Z-7f3a",
+        created="2026-11-21T10:00:00Z",
+        label="demo",
+        depth_scale_m=1e-4,
+        rig=Rig("2026-11-21T09:00:00Z", "front", {"front": camera}, 0.001),
+        frames={"front": frames},
+        spread_s_max=0.012,
+    )
+    return folder
+
+
+def test_frames_come_back_exactly(bundle_folder: Path) -> None:
+    bundle = read_bundle(bundle_folder)
+    rng = np.random.default_rng(0)
+    expected = [rng.integers(0, 40_000, (48, 64), dtype=np.uint16) for _ in range(3)]
+    assert np.array_equal(bundle.depth_stack("front"), expected)
+    assert bundle.frames["front"][2].sequence == 2
+    assert bundle.label == "demo"
+
+
+@pytest.mark.parametrize("length", [0, 4, 100, -1])
+def test_a_torn_frame_is_named(bundle_folder: Path, length: int) -> None:
+    """OpenCV decodes the first rows of a torn PNG and leaves the rest black, in silence."""
+    path = bundle_folder / "depth/front/001.png"
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(BundleError, match=r"001\.png is torn"):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+def test_a_missing_frame_is_named(bundle_folder: Path) -> None:
+    (bundle_folder / "depth/front/002.png").unlink()
+    with pytest.raises(BundleError, match=r"002\.png cannot be read"):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+def _edit(folder: Path, **changes: object) -> None:
+    path = folder / "bundle.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_an_unknown_version_is_refused_with_the_known_ones(bundle_folder: Path) -> None:
+    _edit(bundle_folder, version=2)
+    with pytest.raises(FormatError, match=r"bundle\.json has .* version 2; this program reads 1"):
+        read_bundle(bundle_folder)
+
+
+def test_a_camera_absent_from_the_calibration_is_named(bundle_folder: Path) -> None:
+    cameras = json.loads((bundle_folder / "bundle.json").read_text())["cameras"]
+    _edit(bundle_folder, cameras={"rear": cameras["front"]})
+    with pytest.raises(CalibrationError, match="camera rear is not in calibration"):
+        read_bundle(bundle_folder)
+
+
+def test_a_bundle_cannot_reach_outside_its_folder(bundle_folder: Path) -> None:
+    cameras = json.loads((bundle_folder / "bundle.json").read_text())["cameras"]
+    cameras["front"]["frames"][0]["file"] = "../../secret.png"
+    _edit(bundle_folder, cameras=cameras)
+    with pytest.raises(BundleError, match="outside the bundle"):
+        read_bundle(bundle_folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"cameras": {}}, "no camera has a frame"),
+        ({"depth_scale_m": 0}, "depth_scale_m is 0"),
+        ({"depth_scale_m": 1}, "depth_scale_m is 1"),
+        ({"sync": None}, "scan again"),
+    ],
+)
+def test_contradictions_are_refused(
+    bundle_folder: Path, changes: dict[str, object], words: str
+) -> None:
+    _edit(bundle_folder, **changes)
+    with pytest.raises(BundleError, match=words):
+        read_bundle(bundle_folder)
+
+
+def test_a_folder_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="is not a folder"):
+        read_bundle(tmp_path / "nothing")

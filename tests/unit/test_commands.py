@@ -1,0 +1,56 @@
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from station import cli as station_cli
+from station.lazy_group import LazyGroup
+from workers import cli as workers_cli
+
+_ALL = [
+    (group, name)
+    for group, commands in (
+        (station_cli.station, station_cli.COMMANDS),
+        (workers_cli.reconstruct, workers_cli.COMMANDS),
+    )
+    for name in commands
+]
+
+
+@pytest.mark.parametrize(("group", "name"), _ALL)
+def test_every_command_explains_itself(group: click.Group, name: str) -> None:
+    result = CliRunner().invoke(group, [name, "--help"])
+    assert result.exit_code == 0, result.output
+    assert "Examples:" in result.output
+
+
+@pytest.mark.parametrize("group", [station_cli.station, workers_cli.reconstruct])
+def test_help_lists_every_command_without_importing_it(
+    group: LazyGroup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> None:
+        raise AssertionError(f"--help imported {name}")
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+    result = CliRunner().invoke(group, ["--help"])
+    assert result.exit_code == 0
+    assert all(name in result.output for name in group.list_commands(click.Context(group)))
+
+
+def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
+    """A traceback once told an operator nothing about the file that was missing."""
+    missing = tmp_path / "booth.toml"
+    done = subprocess.run(
+        [sys.executable, "-m", "station.cli", "capture", "front", "--config", str(missing)],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: {missing} cannot be read")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,81 @@
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from station import files
+from station.errors import BundleError, FormatError
+
+
+def test_json_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    files.write_json(path, {"format": "x", "version": 2, "name": "Zoë"})
+    assert files.read_json(path, format="x", versions={1, 2})["name"] == "Zoë"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_not_a_number_never_reaches_a_file(tmp_path: Path) -> None:
+    """json.dumps writes NaN by default, which other languages' readers refuse."""
+    with pytest.raises(ValueError):
+        files.write_json(tmp_path / "a.json", {"value": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "is missing"),
+        ('{"format": "x", "ver', "cannot be read as JSON"),
+        ("[]", "is not a x file"),
+        ('{"format": "y", "version": 1}', "its format is 'y'"),
+        ('{"format": "x", "version": 9}', "version 9; this program reads 1, 2"),
+        ('{"format": "x", "version": true}', "version True"),
+    ],
+)
+def test_unreadable_documents_are_named(tmp_path: Path, content: str | None, words: str) -> None:
+    path = tmp_path / "a.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(BundleError) as raised:
+        files.read_json(path, format="x", versions={1, 2}, error=BundleError)
+    assert words in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert issubclass(BundleError, FormatError)
+
+
+def test_publish_never_overwrites(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    with pytest.raises(FileExistsError):
+        files.publish_folder(tmp_path / "a", tmp_path / "b")
+
+
+def _rewrite_for_ever(path: Path) -> None:
+    generation = 0
+    while True:
+        generation += 1
+        files.write_json(path, {"format": "x", "version": 1, "load": [generation] * 20_000})
+
+
+def test_a_document_is_whole_after_kill(tmp_path: Path) -> None:
+    """An in-place write torn by kill -9 once left a state file that no restart could read."""
+    path = tmp_path / "state.json"
+    for delay_s in (0.05, 0.11, 0.17):
+        writer = multiprocessing.get_context("spawn").Process(
+            target=_rewrite_for_ever, args=(path,)
+        )
+        writer.start()
+        deadline = time.monotonic() + 20.0
+        while not path.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        assert writer.pid is not None
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+        load = json.loads(path.read_text())["load"]
+        assert len(load) == 20_000
+        assert len(set(load)) == 1

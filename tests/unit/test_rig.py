@@ -1,0 +1,94 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
+from station.errors import CalibrationError, FormatError
+from station.geometry import se3_exp
+
+
+def make_rig() -> Rig:
+    camera = CameraCalibration(
+        name="front-upper",
+        serial="A001",
+        model="kinect-v1",
+        width=640,
+        height=480,
+        K=np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]]),
+        distortion=np.zeros(5),
+        depth_correction=DepthCorrection((0.001, 0.99)),
+        world_from_camera=se3_exp([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]),
+        covariance=np.eye(6) * 1e-6,
+    )
+    return Rig("2026-11-21T10:00:00Z", "front-upper", {camera.name: camera}, 0.0017)
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    make_rig().save(path)
+    found, expected = Rig.load(path).cameras["front-upper"], make_rig().cameras["front-upper"]
+    assert np.array_equal(found.world_from_camera, expected.world_from_camera)
+    assert found.covariance is not None
+    assert found.covariance[0, 0] == 1e-6
+    assert found.depth_correction == expected.depth_correction
+
+
+def test_depth_correction_acts_on_inverse_depth() -> None:
+    correction = DepthCorrection((0.01, 1.02))
+    depth = np.array([0.0, 0.8, 2.0], dtype=np.float32)
+    corrected = correction.apply(depth)
+    assert corrected[0] == 0.0
+    assert np.allclose(1.0 / corrected[1:], 0.01 + 1.02 / depth[1:], rtol=1e-6)
+    assert corrected.dtype == np.float32
+    assert DepthCorrection().apply(depth) is depth
+
+
+def _set(*keys: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        for key in keys[:-1]:
+            document = document[key]
+        document[keys[-1]] = value
+
+    return change
+
+
+_CAMERA = ("cameras", "front-upper")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_set(*_CAMERA, "K", value=[[1, 0], [0, 1]]), "K must be (3, 3)"),
+        (_set(*_CAMERA, "K", value=np.zeros((3, 3)).tolist()), "positive focal lengths"),
+        (_set(*_CAMERA, "world_from_camera", value=np.ones((4, 4)).tolist()), "not a rigid"),
+        (
+            _set(*_CAMERA, "world_from_camera", value=np.diag([1, 1, -1, 1]).tolist()),
+            "not a rigid",
+        ),
+        (_set(*_CAMERA, "depth_correction", value={"model": "spline"}), "'spline' is unknown"),
+        (_set(*_CAMERA, "distortion", value=[0, 0, 0, 0, None]), "distortion must be"),
+        (_set("cameras", value={}), "no camera"),
+        (_set("cameras", value=[1]), "calibrate anew"),
+        (lambda document: document.pop("reference"), "'reference' is missing"),
+    ],
+)
+def test_an_unusable_calibration_is_named(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], words: str
+) -> None:
+    document = make_rig().to_json()
+    change(document)
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(FormatError) as raised:
+        Rig.load(path)
+    assert words in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+def test_an_unknown_camera_is_named_with_the_known_ones() -> None:
+    with pytest.raises(CalibrationError, match=r"camera left .*it has: front-upper"):
+        make_rig().camera("left")
