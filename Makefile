@@ -1,0 +1,61 @@
+# Two commands do all the set-up on a fresh Debian machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := demo
+BENCHES := bench-capture bench-preprocess bench-fit bench-measure bench-calibration
+
+.PHONY: help demo test check format train clean $(BENCHES)
+
+help:
+	@echo "make demo     a booth of four replayed Kinects: calibrate, scan, print the result"
+	@echo "make test     all tests"
+	@echo "make check    lint, formatting and types"
+	@echo "make train    learn the body model anew (30 minutes)"
+	@echo "make $(BENCHES)   tables of speed and accuracy"
+
+demo: $(VENV)/runtime.stamp
+	$(BIN)/python deploy/demo.py --folder $(DEMO)
+
+test: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest
+
+check: $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/dev.stamp
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+train: $(VENV)/train.stamp
+	$(BIN)/reconstruct train --out workers/scape/data/body.npz
+
+# The benchmarks of the fit and of the measurements render bodies that the model never saw, which
+# takes the training extra.
+bench-fit bench-measure: $(VENV)/train.stamp
+bench-capture bench-preprocess bench-calibration: $(VENV)/dev.stamp
+$(BENCHES): bench-%:
+	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
+
+$(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
+	sh deploy/install-system.sh $(PYTHON)
+	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+$(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@ $(VENV)/runtime.stamp
+
+$(VENV)/train.stamp: $(VENV)/dev.stamp pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'torch==2.13.0'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,train]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) $(DEMO) build *.egg-info
