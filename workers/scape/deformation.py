@@ -1,0 +1,109 @@
+"""Deformation gradients on one topology: taking a surface apart into edges and putting it together.
+
+SCAPE (Anguelov et al. 2005) transforms the edges of every triangle and asks for the vertices whose
+edges come nearest in area-weighted least squares. With all three edges of a triangle the normal
+matrix is a weighted graph Laplacian L. It depends on the template alone and is factored once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from cholespy import CholeskySolverD, MatrixType
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int32]
+
+_PINNED = 0
+"""A Laplacian leaves the translation free: this vertex stays where the input has it."""
+
+
+def triangle_areas(vertices: Array, faces: Faces) -> Array:
+    """Areas (K,) in square metres."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def vertex_areas(vertices: Array, faces: Faces) -> Array:
+    """A third of the areas of the triangles around each vertex, (P,) in square metres."""
+    thirds = np.repeat(triangle_areas(vertices, faces) / 3.0, 3)
+    return np.bincount(faces.ravel(), thirds, minlength=len(vertices))
+
+
+def vertex_normals(vertices: Array, faces: Faces) -> Array:
+    """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    corners = faces.ravel()
+    normals = np.stack(
+        [np.bincount(corners, weighted[:, i], minlength=len(vertices)) for i in range(3)], axis=1
+    )
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
+
+
+def edges(vertices: Array, faces: Faces) -> Array:
+    """The three edges of every triangle, (K, 3, 3): triangle, edge, coordinate."""
+    corners = vertices[faces]
+    return np.asarray(np.roll(corners, -1, axis=1) - corners)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeSolver:
+    """Vertices from edges for one template: argmin_Y sum_k a_k sum_e |e_k - (y_j - y_i)|^2."""
+
+    faces: Faces
+    triangle_weights: Array
+    """a_k: areas of the template's triangles, normalised to mean 1, (K,)."""
+    incidence: sp.csr_matrix
+    """(P, 3K): adjoint of the map from vertices to weighted edges."""
+    laplacian: sp.csr_matrix
+    """(P, P)."""
+    solver: CholeskySolverD
+
+    @classmethod
+    def build(cls, vertices: Array, faces: Faces) -> EdgeSolver:
+        """Factor the normal matrix of a template's triangles."""
+        areas = triangle_areas(vertices, faces)
+        # Slivers would vanish from the sum and leave their vertices loose.
+        weights = np.maximum(areas / areas.mean(), 1e-2)
+        count = len(vertices)
+        tail = faces.ravel()
+        head = np.roll(faces, -1, axis=1).ravel()
+        column = np.arange(len(tail))
+        weight = np.repeat(weights, 3)
+        incidence = sp.csr_matrix(
+            (np.r_[weight, -weight], (np.r_[head, tail], np.r_[column, column])),
+            shape=(count, len(column)),
+        )
+        gradient = sp.csr_matrix(
+            (
+                np.r_[np.ones_like(weight), -np.ones_like(weight)],
+                (np.r_[column, column], np.r_[head, tail]),
+            ),
+            shape=(len(column), count),
+        )
+        laplacian = (incidence @ gradient).tocsr()
+        pinned = laplacian + sp.csr_matrix(([1.0], ([_PINNED], [_PINNED])), shape=laplacian.shape)
+        coordinates = pinned.tocoo()
+        solver = CholeskySolverD(
+            count, coordinates.row, coordinates.col, coordinates.data, MatrixType.COO
+        )
+        return cls(faces, weights, incidence, laplacian, solver)
+
+    def solve(self, right_hand_side: Array) -> Array:
+        """Solve L x = b for columns (P, m); every column of x is 0 at the pinned vertex."""
+        b = np.ascontiguousarray(right_hand_side, dtype=np.float64)
+        x = np.empty_like(b)
+        for start in range(0, b.shape[1], 96):
+            part = np.ascontiguousarray(b[:, start : start + 96])
+            solved = np.empty_like(part)
+            self.solver.solve(part, solved)
+            x[:, start : start + 96] = solved
+        return np.asarray(x - x[_PINNED])
+
+    def vertices(self, edges_: Array) -> Array:
+        """Vertices (P, 3) whose edges come nearest to (K, 3, 3), with vertex 0 at the origin."""
+        return self.solve(self.incidence @ edges_.reshape(-1, 3))
