@@ -1,0 +1,203 @@
+"""The virtual Kinect: a body mesh seen by simulated sensors, live, as recordings or as a bundle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.bundle import CapturedFrame, write_bundle
+from station.calibration.rig import CameraCalibration, Rig
+from station.drivers.base import DepthFrame, DeviceInfo
+from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
+from station.drivers.virtual_noise import TrueView, UnitError, observe
+from station.drivers.virtual_scene import (
+    Mesh,
+    VirtualScene,
+    booth_walls,
+    default_rig,
+    load_mesh,
+    moved,
+)
+from station.errors import DriverError, InputError
+from station.recording import RecordedFrame
+
+Array = NDArray[np.float64]
+
+TICK_HZ = 60_000_000
+FRAME_RATE_HZ = 30.0
+_SWAY_PHASES = 6
+_SWAY_PERIOD_S = 3.1
+_LIVE_LOOP_FRAMES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedBooth:
+    """What can go right and wrong in a virtual booth; the defaults are an ordinary day."""
+
+    rig: Rig = field(default_factory=default_rig)
+    """The calibration that the station believes."""
+    seed: int = 0
+    sway_m: float = 0.002
+    """How far the person moves to either side."""
+    bias_m: float = 0.0
+    """Size of each unit's systematic depth error at 2 m."""
+    drop_rate: float = 0.0
+    """Share of the frames that are lost."""
+    moved_cameras: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Camera -> (metres, radians) by which it stands off its calibration."""
+    clutter: Sequence[Mesh] = ()
+    """Further objects: a chair, a second person."""
+    walls: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualFrame:
+    """One raw frame with the unit's own clock."""
+
+    time_s: float
+    ticks: int
+    sequence: int
+    raw: NDArray[np.uint16]
+
+
+class VirtualCamera:
+    """One simulated unit in front of a body; the same seed gives the same frames."""
+
+    def __init__(self, booth: SimulatedBooth, name: str, body: Mesh | None) -> None:
+        camera = booth.rig.cameras[name]
+        index = list(booth.rig.cameras).index(name)
+        self._rng = np.random.default_rng((booth.seed, index))
+        unit = np.random.default_rng((booth.seed, index, 1))
+        self._booth, self._camera = booth, camera
+        self._unit = UnitError(
+            booth.bias_m * unit.uniform(-1.0, 1.0), tuple(unit.uniform(-0.3, 0.3, 2))
+        )
+        self.drift = unit.uniform(-80e-6, 80e-6)
+        self.phase_s = unit.uniform(0.0, 1.0 / FRAME_RATE_HZ)
+        self._first_tick = int(unit.integers(0, 2**32))
+        self._views = _sway_views(booth, camera, body)
+
+    def frames(self, count: int) -> Iterator[VirtualFrame]:
+        """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
+        for sequence in range(count):
+            time_s = self.phase_s + sequence / FRAME_RATE_HZ
+            phase = int(time_s / _SWAY_PERIOD_S * _SWAY_PHASES * 2) % len(self._views)
+            raw = observe(self._views[phase], self._unit, self._rng)
+            if self._rng.random() < self._booth.drop_rate:
+                continue
+            ticks = (self._first_tick + round(time_s * TICK_HZ * (1.0 + self.drift))) % 2**32
+            yield VirtualFrame(time_s, ticks, sequence, raw)
+
+
+def _sway_views(
+    booth: SimulatedBooth, camera: CameraCalibration, body: Mesh | None
+) -> list[TrueView]:
+    pose = camera.world_from_camera
+    if camera.name in booth.moved_cameras:
+        pose = moved(pose, *booth.moved_cameras[camera.name])
+    around = [*(booth_walls() if booth.walls else ()), *booth.clutter]
+    phases = _SWAY_PHASES if body is not None and booth.sway_m > 0 else 1
+    views = []
+    for phase in range(phases):
+        meshes = list(around)
+        if body is not None:
+            angle = np.pi * phase / max(phases - 1, 1)
+            # Feet stay; the rest leans with height.
+            lean = booth.sway_m * np.cos(angle) if phases > 1 else 0.0
+            share = np.clip(body.vertices[:, 2:] / 1.7, 0.0, 1.2)
+            swayed = body.vertices + share * lean * np.array([0.6, 0.8, 0.0])
+            meshes.append(Mesh(swayed, body.faces, body.dark))
+        if not meshes:
+            raise InputError("the virtual booth holds nothing to look at")
+        views.append(VirtualScene(meshes).view(camera, pose))
+    return views + views[-2:0:-1]
+
+
+def render_bundle(
+    body: Mesh | None,
+    folder: Path,
+    booth: SimulatedBooth | None = None,
+    *,
+    frames: int = 10,
+    scan_id: str = "virtual",
+) -> Path:
+    """Write the scan bundle that a booth with this body in it would give."""
+    booth = booth or SimulatedBooth()
+    taken = {}
+    for name in booth.rig.cameras:
+        camera = VirtualCamera(booth, name, body)
+        taken[name] = [
+            CapturedFrame(TABLE[frame.raw], frame.ticks, TICK_HZ, frame.time_s, frame.sequence)
+            for frame in camera.frames(frames)
+        ]
+    write_bundle(
+        folder,
+        scan_id=scan_id,
+        created="2026-01-01T00:00:00Z",
+        label="virtual",
+        depth_scale_m=DEPTH_SCALE_M,
+        rig=booth.rig,
+        frames=taken,
+        spread_s_max=1.0 / FRAME_RATE_HZ,
+    )
+    return folder
+
+
+def recorded_frames(camera: VirtualCamera, count: int) -> Iterator[RecordedFrame]:
+    """A camera's frames as a recording holds them."""
+    for frame in camera.frames(count):
+        yield RecordedFrame(frame.time_s, frame.ticks, frame.raw)
+
+
+class VirtualDriver:
+    """A simulated sensor in real time: a loop of frames is rendered once, then played."""
+
+    def __init__(self, name: str, body: Path, seed: int) -> None:
+        self._name, self._body, self._seed = name, body, seed
+        self._loop: list[VirtualFrame] = []
+        self._start_s = 0.0
+        self._sequence = 0
+
+    def open(self) -> DeviceInfo:
+        booth = SimulatedBooth(seed=self._seed)
+        if self._name not in booth.rig.cameras:
+            known = ", ".join(booth.rig.cameras)
+            raise DriverError(f"camera {self._name}: the virtual booth has only {known}")
+        camera = VirtualCamera(booth, self._name, load_mesh(self._body))
+        self._loop = list(camera.frames(_LIVE_LOOP_FRAMES))
+        self._drift, self._first = camera.drift, self._loop[0].ticks
+        self._start_s = time.monotonic() + camera.phase_s
+        self._sequence = 0
+        calibration = booth.rig.cameras[self._name]
+        return DeviceInfo(
+            serial=calibration.serial,
+            model="virtual",
+            width=calibration.width,
+            height=calibration.height,
+            K=calibration.K,
+            distortion=calibration.distortion,
+            depth_scale_m=DEPTH_SCALE_M,
+            tick_hz=TICK_HZ,
+            tick_bits=32,
+        )
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        due_s = self._sequence / FRAME_RATE_HZ
+        wait_s = self._start_s + due_s - time.monotonic()
+        if wait_s > timeout_s:
+            time.sleep(timeout_s)
+            return None
+        time.sleep(max(wait_s, 0.0))
+        frame = self._loop[self._sequence % len(self._loop)]
+        ticks = (self._first + round(due_s * TICK_HZ * (1.0 + self._drift))) % 2**32
+        result = DepthFrame(TABLE[frame.raw], ticks, time.monotonic(), self._sequence)
+        self._sequence += 1
+        return result
+
+    def close(self) -> None:
+        self._loop = []

@@ -1,0 +1,98 @@
+"""What a structured-light Kinect v1 does to a true depth image.
+
+Geometry and figures: baseline 75 mm, disparity steps of 1/8 px (Khoshelham & Elberink 2012: random
+error 1.425e-3 z^2 m), errors correlated over the matching window of about 9 x 9 px, no reading
+beyond 70-75 degrees of incidence or in the projector's shadow, silhouette pixels that flicker and
+fly (Nguyen, Izadi & Lovell 2012). Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.drivers.raw11 import NO_READING
+
+BASELINE_M = 0.075
+_RANDOM_COEFFICIENT = 1.425e-3
+_WINDOW_PX = 9
+_FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
+_RANGE_M = (0.5, 4.5)
+
+Image = NDArray[np.float32]
+
+
+def raw_from_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """The nearest raw 11-bit values; no reading where the depth is 0 or out of range."""
+    seen = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
+    raw = 2842.5 * (np.arctan(np.where(seen, depth_m, 1.0) / 0.1236) - 1.1863)
+    return np.where(seen, np.clip(np.rint(raw), 0, NO_READING - 1), NO_READING).astype(np.uint16)
+
+
+@dataclass(frozen=True, slots=True)
+class TrueView:
+    """What a perfect sensor would see, (h, w) each."""
+
+    depth_m: Image
+    """Distance along the optical axis; 0 = nothing."""
+    incidence_rad: Image
+    lit: NDArray[np.bool_]
+    """Where the projector's light arrives."""
+    reflects: NDArray[np.bool_]
+    """False on dark hair or underwear, which give no reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnitError:
+    """One sensor's smooth systematic depth error."""
+
+    bias_m: float = 0.0
+    """Its size at 2 m, growing with z^2."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """How much it changes over the image, relative, per half width and half height."""
+
+    def apply(self, depth_m: Image) -> Image:
+        if self.bias_m == 0.0:
+            return depth_m
+        height, width = depth_m.shape
+        x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
+        y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+        shape = 1.0 + self.tilt[0] * x + self.tilt[1] * y
+        return np.asarray(depth_m + self.bias_m * shape * np.square(depth_m / 2.0), np.float32)
+
+
+def observe(view: TrueView, unit: UnitError, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """One noisy raw 11-bit frame (h, w) of what a perfect sensor would see."""
+    depth = unit.apply(view.depth_m)
+    seen = (depth > 0) & view.lit & view.reflects
+    noise = cv2.GaussianBlur(
+        rng.standard_normal(depth.shape, dtype=np.float32), (_WINDOW_PX, _WINDOW_PX), 1.6
+    )
+    noise /= max(float(noise.std()), 1e-6)
+    grazing = np.cos(np.minimum(view.incidence_rad, _FADE_END_RAD))
+    sigma = _RANDOM_COEFFICIENT * np.square(depth) / np.sqrt(np.maximum(grazing, 0.2))
+    measured = np.where(seen, depth + sigma * noise, 0.0).astype(np.float32)
+    fade = (view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD)
+    measured[rng.random(depth.shape, dtype=np.float32) < fade] = 0.0
+    return raw_from_depth(_flying(measured, rng))
+
+
+def _flying(depth: Image, rng: np.random.Generator) -> Image:
+    """Silhouette pixels flicker: some vanish, some jump to the other side, some lie between."""
+    filled = np.where(depth > 0, depth, 9.0).astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(filled, window), cv2.dilate(filled, window)
+    edge = far - near > 0.05
+    fate = rng.random(depth.shape, dtype=np.float32)
+    far = np.where(far > 8.0, near, far)
+    between = near + (far - near) * rng.random(depth.shape, dtype=np.float32)
+    result = depth.copy()
+    result[edge & (fate < 0.30)] = 0.0
+    swapped = edge & (fate >= 0.30) & (fate < 0.55)
+    result[swapped] = near[swapped]
+    flying = edge & (fate >= 0.55) & (fate < 0.65)
+    result[flying] = between[flying]
+    return result
