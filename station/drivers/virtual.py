@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 TICK_HZ = 60_000_000
 FRAME_RATE_HZ = 30.0
-_SWAY_PHASES = 6
+_SWAY_PHASES = 12
 _SWAY_PERIOD_S = 3.1
 _LIVE_LOOP_FRAMES = 24
 
@@ -86,7 +86,7 @@ class VirtualCamera:
         """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
         for sequence in range(count):
             time_s = self.phase_s + sequence / FRAME_RATE_HZ
-            phase = int(time_s / _SWAY_PERIOD_S * _SWAY_PHASES * 2) % len(self._views)
+            phase = int(time_s / _SWAY_PERIOD_S * len(self._views)) % len(self._views)
             raw = observe(self._views[phase], self._unit, self._rng)
             if self._rng.random() < self._booth.drop_rate:
                 continue
@@ -101,21 +101,22 @@ def _sway_views(
     if camera.name in booth.moved_cameras:
         pose = moved(pose, *booth.moved_cameras[camera.name])
     around = [*(booth_walls() if booth.walls else ()), *booth.clutter]
-    phases = _SWAY_PHASES if body is not None and booth.sway_m > 0 else 1
-    views = []
-    for phase in range(phases):
-        meshes = list(around)
-        if body is not None:
-            angle = np.pi * phase / max(phases - 1, 1)
-            # Feet stay; the rest leans with height.
-            lean = booth.sway_m * np.cos(angle) if phases > 1 else 0.0
-            share = np.clip(body.vertices[:, 2:] / 1.7, 0.0, 1.2)
-            swayed = body.vertices + share * lean * np.array([0.6, 0.8, 0.0])
-            meshes.append(Mesh(swayed, body.faces, body.dark))
+    if body is None or booth.sway_m == 0.0:
+        meshes = [*around, *([body] if body is not None else [])]
         if not meshes:
             raise InputError("the virtual booth holds nothing to look at")
-        views.append(VirtualScene(meshes).view(camera, pose))
-    return views + views[-2:0:-1]
+        return [VirtualScene(meshes).view(camera, pose)]
+    seen: dict[float, TrueView] = {}
+    leans = [
+        round(booth.sway_m * float(np.sin(2.0 * np.pi * phase / _SWAY_PHASES)), 6)
+        for phase in range(_SWAY_PHASES)
+    ]
+    # Feet stay; the rest leans with height.
+    share = np.clip(body.vertices[:, 2:] / 1.7, 0.0, 1.2) * (0.6, 0.8, 0.0)
+    for lean in dict.fromkeys(leans):
+        swayed = Mesh(body.vertices + share * lean, body.faces, body.dark)
+        seen[lean] = VirtualScene([*around, swayed]).view(camera, pose)
+    return [seen[lean] for lean in leans]
 
 
 def render_bundle(

@@ -49,7 +49,9 @@ def load_mesh(path: Path) -> Mesh:
             mesh = o3d.io.read_triangle_mesh(str(path))
             vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int32)
     except (OSError, KeyError, ValueError) as cause:
-        raise InputError(f"{path} cannot be read as a mesh ({cause}); give .npz, .ply or .obj") from None
+        raise InputError(
+            f"{path} cannot be read as a mesh ({cause}); give .npz, .ply or .obj"
+        ) from None
     if vertices.ndim != 2 or not len(faces) or not np.isfinite(vertices).all():
         raise InputError(f"{path} holds no usable mesh; give .npz, .ply or .obj in metres")
     if not 0.05 < np.ptp(vertices, axis=0).max() < 10.0:
@@ -202,12 +204,16 @@ class VirtualScene:
             reflects=~self._dark[triangle],
         )
 
-    def _lit(self, world_from_camera: Array, turned: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _lit(
+        self, world_from_camera: Array, turned: Array, depth: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
         """Points that the projector, a baseline beside the camera, reaches."""
         projector = transform(world_from_camera, (BASELINE_M, 0.0, 0.0))
         points = world_from_camera[:3, 3] + turned * depth[..., None]
         towards = (points - projector).astype(np.float32)
-        rays = np.concatenate([np.broadcast_to(projector.astype(np.float32), towards.shape), towards], axis=-1)
+        rays = np.concatenate(
+            [np.broadcast_to(projector.astype(np.float32), towards.shape), towards], axis=-1
+        )
         reach = self._scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
         distance = np.linalg.norm(towards, axis=-1)
         return np.asarray((1.0 - reach) * distance < _SHADOW_TOLERANCE_M)

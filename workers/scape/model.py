@@ -51,7 +51,7 @@ class BodyState:
     """(3,): where the pelvis' centroid is, metres."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BodyModel:
     """A learned model. L parts, P vertices, K triangles, B shape components."""
 

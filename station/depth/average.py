@@ -1,0 +1,95 @@
+"""The robust mean of a few depth frames of a body that stands still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+_SIGMA_COEFFICIENT = 1.425e-3
+"""Random error of a Kinect v1: sigma_z = c z^2 (Khoshelham & Elberink 2012)."""
+_GATE_SIGMAS = 3.0
+_STEP_COEFFICIENT = 1.0 / (8.0 * 585.0 * 0.075)
+"""Depth step of 1/8 px of disparity: z^2 / (8 f b)."""
+
+
+@dataclass(frozen=True, slots=True)
+class AveragedDepth:
+    """One camera's frames as one image, (h, w) each."""
+
+    depth_m: NDArray[np.float32]
+    """Mean of the readings near their median; 0 where too few agree."""
+    count: NDArray[np.uint8]
+    """How many readings the mean is of."""
+    change_m: NDArray[np.float32]
+    """Mean of the last third less that of the first; NaN where either has no reading."""
+
+
+def random_sigma_m(depth_m: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Standard deviation of one reading at a depth."""
+    return np.asarray(_SIGMA_COEFFICIENT * np.square(depth_m))
+
+
+def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
+    """Average (frames, h, w) readings in units of scale_m, 0 = no reading.
+
+    A pixel needs readings in two fifths of the frames (flickering edges have fewer); readings
+    beyond three standard deviations and one disparity step of the median are left out.
+    """
+    frames = len(stack)
+    least = max(1, int(np.ceil(0.4 * frames)))
+    depth = np.zeros(stack.shape[1:], np.float32)
+    count = np.zeros(stack.shape[1:], np.uint8)
+    change = np.full(stack.shape[1:], np.nan, np.float32)
+    _average(stack, np.float32(scale_m), least, max(1, frames // 3), depth, count, change)
+    return AveragedDepth(depth, count, change)
+
+
+@numba.njit(cache=True, nogil=True)
+def _average(stack, scale, least, third, depth, count, change):  # type: ignore[no-untyped-def]  # pragma: no cover
+    frames, height, width = stack.shape
+    values = np.empty(frames, np.float32)
+    order = np.empty(frames, np.float32)
+    for y in range(height):
+        for x in range(width):
+            valid = 0
+            for i in range(frames):
+                value = stack[i, y, x] * scale
+                values[i] = value
+                if value > 0.0:
+                    j = valid
+                    while j > 0 and order[j - 1] > value:
+                        order[j] = order[j - 1]
+                        j -= 1
+                    order[j] = value
+                    valid += 1
+            if valid < least:
+                continue
+            median = np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])
+            square = median * median
+            gate = _GATE_SIGMAS * _SIGMA_COEFFICIENT * square + _STEP_COEFFICIENT * square
+            total = np.float32(0.0)
+            kept = 0
+            early = np.float32(0.0)
+            early_count = 0
+            late = np.float32(0.0)
+            late_count = 0
+            for i in range(frames):
+                value = values[i]
+                if value > 0.0 and abs(value - median) <= gate:
+                    total += value
+                    kept += 1
+                    if i < third:
+                        early += value
+                        early_count += 1
+                    elif i >= frames - third:
+                        late += value
+                        late_count += 1
+            if kept < least:
+                continue
+            depth[y, x] = total / kept
+            count[y, x] = kept
+            if early_count > 0 and late_count > 0:
+                change[y, x] = late / late_count - early / early_count

@@ -1,0 +1,285 @@
+"""A scan bundle's frames as one cloud of one person, with what else the cameras say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from station.bundle import Bundle
+from station.calibration.rig import CameraCalibration
+from station.depth.average import average, random_sigma_m
+from station.depth.points import Image, camera_points, jumps, normals
+from station.errors import InputError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BILATERAL_DIAMETER_PX = 7
+_BILATERAL_RANGE_SIGMAS = 2.5
+_BILATERAL_SPACE_PX = 2.0
+_MAX_INCIDENCE_COSINE = np.cos(np.radians(76.0))
+_VOXEL_M = 0.04
+_LEAST_POINTS = 2000
+_SECOND_PERSON_SHARE = 0.15
+_SECOND_PERSON_HEIGHT_M = 0.7
+_MOTION_M = 0.010
+_SIGMA_FLOOR_M = 4e-4
+"""What averaging more frames does not take away: quantisation, calibration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Volume:
+    """The part of the world in which the person is looked for, metres."""
+
+    min_m: tuple[float, float, float] = (-0.95, -0.75, 0.0)
+    max_m: tuple[float, float, float] = (0.95, 0.75, 2.2)
+    floor_clearance_m: float = 0.012
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that the operator should know of."""
+
+    code: str
+    """"motion", "two-people", "camera-blind" or "frames-missing"."""
+    camera: str | None
+    value: float | None
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """One camera's cleaned image, (h, w) each."""
+
+    name: str
+    calibration: CameraCalibration
+    depth_m: Image
+    """Averaged, corrected, filtered; 0 = no reading."""
+    person: Mask
+    background: Mask
+    """Measured, and not the person."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """Points (n, 3) on the person in the world frame."""
+
+    points: Array
+    normals: Array
+    """(n, 3), unit, towards the camera."""
+    sigma_m: Array
+    """(n,): standard deviation along the ray."""
+    camera: NDArray[np.int16]
+    """(n,): index into camera_names."""
+    camera_names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class Preprocessed:
+    """What the fit works on."""
+
+    cloud: PointCloud
+    views: tuple[CameraView, ...]
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Camera:
+    """One camera's surface points inside the volume, flat."""
+
+    calibration: CameraCalibration
+    depth_m: Image
+    pixels: NDArray[np.int64]
+    points: Array
+    normals: Array
+    sigma_m: Array
+    change_m: Array
+    frames: int
+
+
+def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
+    """Average, filter, crop and merge a bundle's frames.
+
+    Raises:
+        BundleError: a frame cannot be read.
+        InputError: there is nobody in the booth.
+    """
+    volume = volume or Volume()
+    names = [name for name, frames in bundle.frames.items() if frames]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        cameras = list(pool.map(lambda name: _camera(bundle, name, volume), names))
+    kept, findings = _one_person([camera.points for camera in cameras])
+    views, clouds = [], []
+    expected = max(camera.frames for camera in cameras)
+    for name, camera, keep in zip(names, cameras, kept, strict=True):
+        view, cloud = _cleaned(camera, keep)
+        views.append(view)
+        clouds.append(cloud)
+        findings += _camera_findings(name, camera, keep, expected)
+    findings += [
+        Finding("camera-blind", name, None, f"camera {name} gave no frame; check it")
+        for name in bundle.rig.cameras
+        if name not in names
+    ]
+    return Preprocessed(_merged(names, clouds), tuple(views), tuple(findings))
+
+
+def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
+    calibration = bundle.rig.cameras[name]
+    averaged = average(bundle.depth_stack(name), bundle.depth_scale_m)
+    depth = calibration.depth_correction.apply(averaged.depth_m).astype(np.float32)
+    pose = calibration.world_from_camera
+    near = _in_volume(camera_points(calibration, depth), depth, pose, volume)
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    if not len(rows):
+        nothing = np.empty((0, 3))
+        none = np.empty(0)
+        return _Camera(
+            calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
+            len(bundle.frames[name]),
+        )  # fmt: skip
+    # Everything from here on is done on the person's part of the image alone.
+    top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, depth.shape[0])
+    left, right = max(columns[0] - 8, 0), min(columns[-1] + 9, depth.shape[1])
+    window = np.s_[top:bottom, left:right]
+    part = np.ascontiguousarray(depth[window])
+    edge = jumps(part)
+    typical = float(np.median(part[near[window]]))
+    smooth = cv2.bilateralFilter(
+        part,
+        _BILATERAL_DIAMETER_PX,
+        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.float64(typical))),
+        _BILATERAL_SPACE_PX,
+    )
+    smooth[part == 0] = 0.0
+    image = np.zeros_like(depth)
+    image[window] = smooth
+    points = camera_points(calibration, image)[window]
+    directions, valid = normals(points, smooth)
+    distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
+    cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
+    valid &= near[window] & ~edge & (cosine > _MAX_INCIDENCE_COSINE)
+    y, x = np.nonzero(valid)
+    readings = averaged.count[window][valid].astype(np.float64)
+    sigma = random_sigma_m(smooth[valid].astype(np.float64)) / np.sqrt(readings * cosine[valid])
+    local = points[valid].astype(np.float64)
+    return _Camera(
+        calibration=calibration,
+        depth_m=np.where(image > 0, image, depth),
+        pixels=(y + top) * depth.shape[1] + (x + left),
+        points=local @ pose[:3, :3].T + pose[:3, 3],
+        normals=directions[valid].astype(np.float64) @ pose[:3, :3].T,
+        sigma_m=np.hypot(sigma, _SIGMA_FLOOR_M),
+        change_m=averaged.change_m[window][valid].astype(np.float64),
+        frames=len(bundle.frames[name]),
+    )
+
+
+def _in_volume(points: Image, depth: Image, pose: Array, volume: Volume) -> Mask:
+    world = points @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
+    low = np.array(volume.min_m, np.float32)
+    low[2] = max(low[2], volume.floor_clearance_m)
+    inside = (world > low) & (world < np.array(volume.max_m, np.float32))
+    return np.asarray(inside.all(axis=-1) & (depth > 0))
+
+
+def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
+    """The largest connected body in the booth; small pieces and furniture are left out."""
+    everything = np.concatenate(points)
+    if len(everything) < _LEAST_POINTS:
+        raise InputError(
+            "the booth is empty: the cameras see nobody in its volume; "
+            "ask the person to stand on the mark, or check volume in booth.toml"
+        )
+    low = everything.min(axis=0) - 2 * _VOXEL_M
+    cells = ((everything - low) / _VOXEL_M).astype(np.int64)
+    occupied = np.zeros(cells.max(axis=0) + 3, np.int32)
+    np.add.at(occupied, tuple(cells.T), 1)
+    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= 3))
+    of_point = labels[tuple(cells.T)]
+    sizes = np.bincount(of_point, minlength=count + 1)
+    sizes[0] = 0
+    main = int(np.argmax(sizes))
+    findings = []
+    for label in range(1, count + 1):
+        if label == main or sizes[label] < _SECOND_PERSON_SHARE * sizes[main]:
+            continue
+        height = np.ptp(everything[of_point == label, 2])
+        if height > _SECOND_PERSON_HEIGHT_M:
+            findings.append(
+                Finding("two-people", None, None, "two people (or a large object) in the booth")
+            )
+            break
+    keep = of_point == main
+    ends = np.cumsum([len(part) for part in points])
+    return np.split(keep, ends[:-1]), findings
+
+
+def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
+    person = np.zeros(camera.depth_m.size, bool)
+    person[camera.pixels[keep]] = True
+    person = person.reshape(camera.depth_m.shape)
+    # Pixels at the person's edge are neither: no reading there says what lies behind.
+    near_person = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    view = CameraView(
+        name=camera.calibration.name,
+        calibration=camera.calibration,
+        depth_m=camera.depth_m,
+        person=person,
+        background=(camera.depth_m > 0) & ~near_person,
+    )
+    return view, (camera.points[keep], camera.normals[keep], camera.sigma_m[keep])
+
+
+def _merged(names: list[str], clouds: list[tuple[Array, Array, Array]]) -> PointCloud:
+    sizes = [len(points) for points, _, _ in clouds]
+    return PointCloud(
+        points=np.concatenate([points for points, _, _ in clouds]),
+        normals=np.concatenate([directions for _, directions, _ in clouds]),
+        sigma_m=np.concatenate([sigma for _, _, sigma in clouds]),
+        camera=np.repeat(np.arange(len(names), dtype=np.int16), sizes),
+        camera_names=tuple(names),
+    )
+
+
+def _camera_findings(name: str, camera: _Camera, keep: Mask, expected: int) -> list[Finding]:
+    found = []
+    if not keep.any():
+        message = f"camera {name} sees nothing of the person; check that it is not covered"
+        found.append(Finding("camera-blind", name, None, message))
+    if camera.frames < 0.5 * expected:
+        message = f"camera {name} gave {camera.frames} of {expected} frames; check its connection"
+        found.append(Finding("frames-missing", name, float(camera.frames), message))
+    moved_m = _motion(camera, keep)
+    if moved_m > _MOTION_M:
+        message = f"the person moved {1e3 * moved_m:.0f} mm between frames (camera {name})"
+        found.append(Finding("motion", name, moved_m, message))
+    return found
+
+
+def _motion(camera: _Camera, keep: Mask) -> float:
+    """How far the person moved from the first third of the frames to the last, metres.
+
+    The depth changes are explained by one shift t: n . t = (n . ray) change, in least squares.
+    """
+    chosen = keep & np.isfinite(camera.change_m)
+    if chosen.sum() < 500:
+        return 0.0
+    pose = camera.calibration.world_from_camera
+    offsets = camera.points[chosen] - pose[:3, 3]
+    along = offsets / (offsets @ pose[:3, 2])[:, None]
+    directions = camera.normals[chosen]
+    shift = np.einsum("ni,ni->n", directions, along) * camera.change_m[chosen]
+    gate = 3.0 * np.median(np.abs(shift)) + 1e-4
+    used = np.abs(shift) < gate
+    normal = directions[used].T @ directions[used] + 1e-2 * used.sum() * np.eye(3)
+    return float(np.linalg.norm(np.linalg.solve(normal, directions[used].T @ shift[used])))

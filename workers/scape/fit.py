@@ -1,0 +1,161 @@
+"""The fit of the SCAPE model to a cloud, step by step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.depth import PointCloud, Preprocessed
+from station.errors import InputError
+from workers.scape.correspondence import OrientedTree
+from workers.scape.deformation import vertex_normals
+from workers.scape.initial import initial_state
+from workers.scape.joint import Sampling, Target, fit_jointly
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.paper import fit_like_the_paper
+from workers.scape.surface import SurfaceFit, fit_surface
+from workers.scape.verdict import PartReport, Verdict, judge, report_parts
+
+Array = NDArray[np.float64]
+Method = Literal["joint", "paper"]
+Progress = Callable[[str, float], None]
+
+_LEAST_POINTS = 1500
+_PULLED_POINTS = 5000
+_COARSE_POINTS = 1200
+_CAMERA_POINTS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class FitResult:
+    """A fitted body."""
+
+    state: BodyState
+    vertices: Array
+    """(P, 3): the surface, world frame, metres."""
+    vertex_sigma_m: Array
+    """(P,): posterior standard deviation along the normal."""
+    vertex_seen: NDArray[np.bool_]
+    parts: tuple[PartReport, ...]
+    verdict: Verdict
+    point_to_surface_rms_m: float
+    coverage: float
+    correspondences: int
+    iterations: int
+    camera_shifts_m: dict[str, float]
+    """How far each camera's points lie off the surface that all agree on."""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@lru_cache(maxsize=2)
+def sampling_of(model: BodyModel) -> Sampling:
+    """The model's samples: the same for every scan."""
+    return Sampling.build(model)
+
+
+def fit_body(
+    model: BodyModel,
+    scan: Preprocessed,
+    *,
+    method: Method = "joint",
+    progress: Progress = lambda step, share: None,
+) -> FitResult:
+    """Fit the model to a preprocessed scan.
+
+    Raises:
+        InputError: the cloud holds no body that could be fitted.
+    """
+    cloud = scan.cloud
+    _refuse_absurd(cloud)
+    start = time.monotonic()
+    progress("aligning", 0.0)
+    sampling = sampling_of(model)
+    coarse, _ = sampling.stage(600)
+    pulled = _even_subset(len(cloud), _PULLED_POINTS)
+    target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
+    state = initial_state(model, coarse, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    aligned = time.monotonic()
+    if method == "paper":
+        surface, state, iterations = fit_like_the_paper(
+            model, target, state, lambda share: progress("icp", share)
+        )
+        used = int(np.isfinite(surface.residual_m).sum())
+        fitted = finished = time.monotonic()
+    else:
+        joint = fit_jointly(
+            model, sampling, target, state, progress=lambda share: progress("icp", share)
+        )
+        state, used, iterations = joint.state, joint.correspondences, joint.iterations
+        fitted = time.monotonic()
+        progress("surface", 0.0)
+        surface = fit_surface(model, joint.vertices, target.tree, cloud.sigma_m)
+        finished = time.monotonic()
+    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, target.tree)
+    shifts = _camera_shifts(model, surface, cloud)
+    stature_m = float(np.ptp(surface.vertices[:, 2]))
+    verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
+    progress("done", 1.0)
+    return FitResult(
+        state=state,
+        vertices=surface.vertices,
+        vertex_sigma_m=surface.sigma_m,
+        vertex_seen=surface.seen,
+        parts=parts,
+        verdict=verdict,
+        point_to_surface_rms_m=rms_m,
+        coverage=float(surface.seen.mean()),
+        correspondences=used,
+        iterations=iterations,
+        camera_shifts_m=shifts,
+        seconds={
+            "align": aligned - start,
+            "icp": fitted - aligned,
+            "optimise": finished - fitted,
+            "judge": time.monotonic() - finished,
+        },
+    )
+
+
+def _refuse_absurd(cloud: PointCloud) -> None:
+    if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.normals).all()):
+        raise InputError("the cloud holds values that are not numbers; repair or scan again")
+    if len(cloud) < _LEAST_POINTS:
+        raise InputError(f"the cloud has {len(cloud)} points; a body needs {_LEAST_POINTS}")
+    height_m = float(np.ptp(cloud.points[:, 2]))
+    if not 1.0 < height_m < 2.6:
+        raise InputError(
+            f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected"
+        )
+
+
+def _even_subset(count: int, wanted: int) -> NDArray[np.intp]:
+    """The same pseudo-random subset for the same count: same input, same output."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
+
+
+def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> dict[str, float]:
+    """The rigid shift (m) that would bring each camera's points onto the common surface."""
+    normals = vertex_normals(surface.vertices, model.faces)
+    tree = OrientedTree.build(surface.vertices, normals)
+    shifts = {}
+    for index, name in enumerate(cloud.camera_names):
+        mine = np.flatnonzero(cloud.camera == index)
+        mine = mine[_even_subset(len(mine), 10 * _CAMERA_POINTS)]
+        if len(mine) < _CAMERA_POINTS:
+            continue
+        vertex = tree.nearest(cloud.points[mine], cloud.normals[mine])
+        direction = normals[vertex]
+        away = np.einsum("ni,ni->n", direction, cloud.points[mine] - surface.vertices[vertex])
+        near = np.abs(away) < 0.03
+        direction, away = direction[near], away[near]
+        normal = direction.T @ direction + 1e-3 * len(away) * np.eye(3)
+        shifts[name] = float(np.linalg.norm(np.linalg.solve(normal, direction.T @ away)))
+    return shifts

@@ -1,0 +1,261 @@
+"""Pose, shape and place at once: Gauss-Newton on two-way point-to-plane distances.
+
+Every correspondence is a point p, a vertex v and the vertex' normal n; its residual n . (p - y_v)
+is exact, its derivative that of the sample vertex nearest to v on the template. Rows of one sample
+share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything is multiplied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from station.geometry import so3_exp
+from workers.scape.correspondence import OrientedTree, compatible
+from workers.scape.deformation import vertex_areas, vertex_normals
+from workers.scape.model import BodyModel, BodyState, SampledBody
+
+Array = NDArray[np.float64]
+
+_MODEL_SIGMA_M = 0.003
+"""What shape and pose cannot express; it is shared by neighbours, so rows count less."""
+_ROW_SHARE = 0.12
+_TWIST_INFLATION = 1.5
+_FLOOR_SIGMA_M = 0.004
+_SOLE_BAND_M = 0.012
+_COARSE, _FINE = 600, 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step of the annealing."""
+
+    samples: int
+    components: int
+    gate_m: float
+    angle_rad: float
+    scale_m: float
+    """Of the robust weight: residuals beyond it lose their pull."""
+
+
+SCHEDULE = (
+    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060) for _ in range(4)),
+    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030) for _ in range(4)),
+    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018) for _ in range(3)),
+    *(Stage(_FINE, 130, 0.05, np.radians(45), 0.010) for _ in range(3)),
+    *(Stage(_FINE, 130, 0.03, np.radians(40), 0.006) for _ in range(3)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """Nested sample vertices with the model's derivatives, and who stands for whom."""
+
+    body: SampledBody
+    coarse_of_vertex: NDArray[np.intp]
+    fine_of_vertex: NDArray[np.intp]
+
+    @classmethod
+    def build(cls, model: BodyModel) -> Sampling:
+        """Samples spread evenly; the first ones alone are spread evenly too."""
+        order = _spread(model)
+        return cls(
+            model.at(order),
+            cKDTree(model.mean[order[:_COARSE]]).query(model.mean)[1],
+            cKDTree(model.mean[order]).query(model.mean)[1],
+        )
+
+    def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
+        if count == _FINE:
+            return self.body, self.fine_of_vertex
+        body = SampledBody(self.body.model, self.body.indices[:count], self.body.basis[:count])
+        return body, self.coarse_of_vertex
+
+
+def _spread(model: BodyModel) -> NDArray[np.int64]:
+    """Farthest-point order on the mean body, started from a fixed vertex; the soles' and the
+    face's folds count by area, so that neither takes all the samples."""
+    points = model.mean
+    areas = np.sqrt(vertex_areas(points, model.faces))
+    reach = np.minimum(areas / np.median(areas), 1.0)
+    chosen = np.empty(_FINE, np.int64)
+    distance = np.full(len(points), np.inf)
+    current = int(model.landmarks["crown"])
+    for index in range(_FINE):
+        chosen[index] = current
+        np.minimum(distance, np.linalg.norm(points - points[current], axis=1), out=distance)
+        current = int(np.argmax(distance * reach))
+    return chosen
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The cloud as the fit uses it."""
+
+    tree: OrientedTree
+    sigma_m: Array
+    pulled: NDArray[np.intp]
+    """Points that look for their vertex; a fixed, even subset."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointResult:
+    state: BodyState
+    vertices: Array
+    covariance: Array
+    """(D, D) of (rotations, beta, translation), see SampledBody.jacobian."""
+    correspondences: int
+    iterations: int
+
+
+def fit_jointly(
+    model: BodyModel,
+    sampling: Sampling,
+    target: Target,
+    state: BodyState,
+    schedule: tuple[Stage, ...] = SCHEDULE,
+    progress: Callable[[float], None] = lambda share: None,
+) -> JointResult:
+    """Minimise robust two-way distances with priors, coarse to fine."""
+    prior = _TwistPrior.build(model)
+    covariance = np.eye(1)
+    used = 0
+    for step, stage in enumerate(schedule):
+        body, sample_of_vertex = sampling.stage(stage.samples)
+        vertices = model.vertices(state)
+        weight, pull, used = _data_terms(
+            model, target, vertices, stage, sample_of_vertex, len(body.indices)
+        )
+        state, covariance = _step(model, body, state, stage, weight, pull, prior)
+        progress((step + 1) / len(schedule))
+    return JointResult(state, model.vertices(state), covariance, used, len(schedule))
+
+
+def _data_terms(
+    model: BodyModel,
+    target: Target,
+    vertices: Array,
+    stage: Stage,
+    sample_of_vertex: NDArray[np.intp],
+    samples: int,
+) -> tuple[Array, Array, int]:
+    """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3), and the number of rows."""
+    normals = vertex_normals(vertices, model.faces)
+    cloud = target.tree
+    pulled = target.pulled
+    mine = OrientedTree.build(vertices, normals).nearest(
+        cloud.points[pulled], cloud.normals[pulled]
+    )
+    stride = max(1, len(vertices) // 4000)
+    asking = np.arange(0, len(vertices), stride)
+    found = cloud.nearest(vertices[asking], normals[asking])
+    vertex = np.concatenate([mine, asking])
+    point = np.concatenate([pulled, found])
+    offsets = cloud.points[point] - vertices[vertex]
+    kept = compatible(
+        offsets,
+        normals[vertex],
+        cloud.normals[point],
+        max_distance_m=stage.gate_m,
+        max_angle_rad=stage.angle_rad,
+    )
+    vertex, offsets = vertex[kept], offsets[kept]
+    direction = normals[vertex]
+    residual = np.einsum("ni,ni->n", direction, offsets)
+    variance = target.sigma_m[point[kept]] ** 2 + _MODEL_SIGMA_M**2
+    robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
+    row_weight = _ROW_SHARE * robust / variance
+    floor_vertex, floor_pull, floor_weight = _floor_rows(vertices, normals, stage)
+    vertex = np.concatenate([vertex, floor_vertex])
+    direction = np.concatenate([direction, np.tile((0.0, 0.0, 1.0), (len(floor_vertex), 1))])
+    residual = np.concatenate([residual, floor_pull])
+    row_weight = np.concatenate([row_weight, floor_weight])
+    sample = sample_of_vertex[vertex]
+    weight = np.zeros((samples, 9))
+    outer = (direction[:, :, None] * direction[:, None, :]).reshape(-1, 9)
+    for column in range(9):
+        weight[:, column] = np.bincount(sample, row_weight * outer[:, column], samples)
+    pull = np.stack(
+        [np.bincount(sample, row_weight * residual * direction[:, i], samples) for i in range(3)],
+        axis=1,
+    )
+    return weight.reshape(-1, 3, 3), pull, len(residual)
+
+
+def _floor_rows(
+    vertices: Array, normals: Array, stage: Stage
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """The soles stand on z = 0, which no camera sees; nothing lies below it."""
+    band = max(_SOLE_BAND_M, 0.5 * stage.gate_m)
+    down = (normals[:, 2] < -0.8) & (vertices[:, 2] < _SOLE_BAND_M)
+    touching = np.flatnonzero((down & (vertices[:, 2] > -band)) | (vertices[:, 2] < 0.0))
+    pull = -vertices[touching, 2]
+    return touching, pull, np.full(len(touching), 0.02 / _FLOOR_SIGMA_M**2)
+
+
+@dataclass(frozen=True, slots=True)
+class _TwistPrior:
+    """Gaussian over the relative twists, wider than the training poses."""
+
+    mean: Array
+    information: Array
+
+    @classmethod
+    def build(cls, model: BodyModel) -> _TwistPrior:
+        covariance = model.twist_covariance * _TWIST_INFLATION**2
+        covariance = covariance + np.radians(1.5) ** 2 * np.eye(len(covariance))
+        return cls(model.twist_mean, np.linalg.inv(covariance))
+
+
+def _step(
+    model: BodyModel,
+    body: SampledBody,
+    state: BodyState,
+    stage: Stage,
+    weight: Array,
+    pull: Array,
+    prior: _TwistPrior,
+) -> tuple[BodyState, Array]:
+    """One Gauss-Newton step; returns the new state and the posterior covariance (D, D)."""
+    parts, shapes = model.part_count, model.beta_count
+    active = min(stage.components, shapes)
+    _, derivative = body.jacobian(state)
+    columns = np.r_[np.arange(3 * parts + active), 3 * parts + shapes + np.arange(3)]
+    rows = derivative[:, :, columns].astype(np.float32)
+    weighted = np.einsum("nij,njd->nid", weight.astype(np.float32), rows)
+    size = len(columns)
+    normal = (rows.reshape(-1, size).T @ weighted.reshape(-1, size)).astype(np.float64)
+    gradient = np.einsum("nid,ni->d", rows, pull)
+    shape = slice(3 * parts, 3 * parts + active)
+    normal[shape, shape] += np.eye(active)
+    gradient[shape] -= state.beta[:active]
+    change, twists = _twist_jacobian(model, state)
+    normal[: 3 * parts, : 3 * parts] += change.T @ prior.information @ change
+    gradient[: 3 * parts] -= change.T @ prior.information @ (twists - prior.mean)
+    normal[np.diag_indices_from(normal)] += 1e-6 * np.trace(normal) / size
+    factor = scipy.linalg.cho_factor(normal)
+    delta = scipy.linalg.cho_solve(factor, gradient)
+    turned = np.clip(delta[: 3 * parts].reshape(-1, 3), -0.5, 0.5)
+    beta = state.beta.copy()
+    beta[:active] += delta[shape]
+    new = BodyState(so3_exp(turned) @ state.rotations, beta, state.translation + delta[-3:])
+    return new, scipy.linalg.cho_solve(factor, np.eye(size))
+
+
+def _twist_jacobian(model: BodyModel, state: BodyState) -> tuple[Array, Array]:
+    """Change of the relative twists (3 (L - 1), 3 L) with the parts' turns, and the twists."""
+    parts = model.part_count
+    change = np.zeros((3 * (parts - 1), 3 * parts))
+    for part, parent in enumerate(model.part_parents):
+        if parent < 0:
+            continue
+        back = state.rotations[parent].T
+        row = slice(3 * (part - 1), 3 * part)
+        change[row, 3 * part : 3 * part + 3] = back
+        change[row, 3 * parent : 3 * parent + 3] = -back
+    return change, model.relative_twists(state.rotations)[1:].ravel()

@@ -1,0 +1,134 @@
+"""The last millimetres: a displacement along the normals that lies on dense data and follows the
+model where nobody looked (the paper's E(Y'), with weights from the measured noise).
+
+    min_s  sum_v w_v (s_v - r_v)^2 + stiffness s^T L s,      Y' = Y + s n
+
+w_v and r_v gather all points that belong to vertex v; L is the template's Laplacian, so the field
+is smooth and fades over what no camera saw. Conjugate gradients from the last round's field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import cg
+
+from workers.scape.correspondence import OrientedTree, compatible
+from workers.scape.deformation import vertex_normals
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+
+_ROUNDS = (
+    # gate, angle, stiffness
+    (0.030, np.radians(50), 30.0),
+    (0.020, np.radians(45), 6.0),
+    (0.012, np.radians(40), 1.5),
+)
+_SIGMA_OF_STIFFNESS_M = 0.001
+_FADE = 2e-4
+"""A weak pull towards the model, so that a field cannot drift where there are no data."""
+_INDEPENDENT = 0.25
+"""Share of a vertex' readings that count as independent: matching windows overlap."""
+_LEAST_SIGMA_M = 3e-4
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceFit:
+    """A surface on the data. P vertices."""
+
+    vertices: Array
+    sigma_m: Array
+    """(P,): posterior standard deviation along the normal."""
+    seen: NDArray[np.bool_]
+    """(P,): points lie on the vertex' own neighbourhood."""
+    residual_m: Array
+    """(P,): mean signed distance of its points after the fit; NaN where there are none."""
+
+
+def fit_surface(
+    model: BodyModel, vertices: Array, cloud: OrientedTree, sigma_m: Array
+) -> SurfaceFit:
+    """Lay the model's surface (P, 3) on the cloud's points."""
+    laplacian = model.solver.laplacian
+    identity = sp.identity(len(vertices), format="csr")
+    current = vertices
+    weight = np.zeros(len(vertices))
+    residual = np.zeros(len(vertices))
+    for gate_m, angle_rad, stiffness in _ROUNDS:
+        normals = vertex_normals(current, model.faces)
+        residual, weight = _gathered(current, normals, cloud, sigma_m, gate_m, angle_rad)
+        bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
+        matrix = sp.diags(weight) + bending * (laplacian + _FADE * identity)
+        step, _ = cg(
+            matrix, weight * residual, rtol=1e-4, maxiter=250, M=sp.diags(1.0 / matrix.diagonal())
+        )
+        step *= _hold(model, current, normals, step)
+        current = current + step[:, None] * normals
+    normals = vertex_normals(current, model.faces)
+    residual, weight = _gathered(current, normals, cloud, sigma_m, _ROUNDS[-1][0], np.radians(40))
+    seen = weight > 0
+    return SurfaceFit(
+        current, _posterior_sigma(model, weight), seen, np.where(seen, residual, np.nan)
+    )
+
+
+def _gathered(
+    vertices: Array,
+    normals: Array,
+    cloud: OrientedTree,
+    sigma_m: Array,
+    gate_m: float,
+    angle_rad: float,
+) -> tuple[Array, Array]:
+    """Each vertex' mean distance (P,) to its points along the normal, and its information."""
+    vertex = OrientedTree.build(vertices, normals).nearest(cloud.points, cloud.normals)
+    offsets = cloud.points - vertices[vertex]
+    kept = compatible(
+        offsets,
+        normals[vertex],
+        cloud.normals,
+        max_distance_m=gate_m,
+        max_angle_rad=angle_rad,
+    )
+    vertex, offsets = vertex[kept], offsets[kept]
+    distance = np.einsum("ni,ni->n", normals[vertex], offsets)
+    information = _INDEPENDENT / np.maximum(sigma_m[kept], _LEAST_SIGMA_M) ** 2
+    count = len(vertices)
+    weight = np.bincount(vertex, information, count)
+    total = np.bincount(vertex, information * distance, count)
+    return total / np.maximum(weight, 1e-12), weight
+
+
+def _hold(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
+    """1 where a step keeps every triangle's side, less where it would flip one."""
+    faces = model.faces
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    before = np.cross(b - a, c - a)
+    factor = np.ones(len(vertices))
+    for _ in range(4):
+        moved = vertices + (factor * step)[:, None] * normals
+        a, b, c = (moved[faces[:, i]] for i in range(3))
+        after = np.cross(b - a, c - a)
+        flipped = np.einsum("ki,ki->k", before, after) <= 0.1 * np.einsum(
+            "ki,ki->k", before, before
+        )
+        if not flipped.any():
+            break
+        factor[np.unique(faces[flipped])] *= 0.4
+    return factor
+
+
+def _posterior_sigma(model: BodyModel, weight: Array) -> Array:
+    """Standard deviation (P,): data and the model's own spread, diffused to the neighbours."""
+    prior = 1.0 / np.maximum(model.vertex_sigma_m, 5e-4) ** 2
+    laplacian = model.solver.laplacian
+    degree = laplacian.diagonal()
+    spread = weight.copy()
+    # What a vertex knows helps its neighbours within a few edges.
+    for _ in range(4):
+        spread = np.maximum(weight, 0.5 * (spread - (laplacian @ spread) / degree))
+    return np.asarray(1.0 / np.sqrt(prior + spread))

@@ -1,0 +1,106 @@
+"""Can the result be trusted? Per-part residuals and coverage, in the operator's words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.depth import Finding
+from workers.scape.correspondence import OrientedTree
+from workers.scape.deformation import vertex_areas, vertex_normals
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+
+_SEEN_ENOUGH = 0.22
+_EXTREMITY_SEEN_ENOUGH = 0.10
+_PART_RESIDUAL_M = 0.012
+_UNEXPLAINED_SHARE = 0.06
+_UNEXPLAINED_M = 0.03
+_CAMERA_SHIFT_M = 0.005
+_STATURE_M = (1.30, 2.25)
+_IMPLAUSIBLE_BETA = 6.0
+_EXTREMITIES = ("hand", "thumb", "fingers", "foot", "shoulder", "neck")
+
+
+@dataclass(frozen=True, slots=True)
+class PartReport:
+    """How well one part of the body was seen and met."""
+
+    name: str
+    coverage: float
+    """Share of its area that cameras saw."""
+    residual_rms_m: float
+    """Of the points that belong to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """ "ok" or "rescan", and why."""
+
+    status: str
+    reasons: tuple[str, ...]
+
+
+def report_parts(
+    model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: OrientedTree
+) -> tuple[tuple[PartReport, ...], float, float]:
+    """Reports by part, the point-to-surface rms in metres and the share of unexplained points."""
+    areas = vertex_areas(vertices, model.faces)
+    normals = vertex_normals(vertices, model.faces)
+    every = slice(None, None, max(1, len(cloud.points) // 20_000))
+    points, directions = cloud.points[every], cloud.normals[every]
+    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
+    offsets = points - vertices[vertex]
+    away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
+    unexplained = np.linalg.norm(offsets, axis=1) > _UNEXPLAINED_M
+    part = model.part_of_vertex
+    reports = []
+    for index, name in enumerate(model.part_names):
+        mine = part == index
+        if not mine.any():
+            continue
+        own = (part[vertex] == index) & ~unexplained
+        rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
+        coverage = float(areas[mine & seen].sum() / areas[mine].sum())
+        reports.append(PartReport(name, coverage, rms))
+    rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
+    return tuple(reports), rms, float(unexplained.mean())
+
+
+def judge(
+    parts: Sequence[PartReport],
+    findings: Sequence[Finding],
+    unexplained: float,
+    stature_m: float,
+    beta: Array,
+    camera_shifts_m: dict[str, float],
+) -> Verdict:
+    """Decide whether to scan again."""
+    reasons = [finding.message for finding in findings]
+    if unexplained > _UNEXPLAINED_SHARE:
+        reasons.append(
+            f"{100 * unexplained:.0f} % of what the cameras saw does not belong to a body; "
+            "clear the booth, or ask for tight clothes"
+        )
+    if not _STATURE_M[0] < stature_m < _STATURE_M[1]:
+        reasons.append(f"the body is {stature_m:.2f} m tall; only adults can be measured")
+    if float(np.abs(beta[:10]).max(initial=0.0)) > _IMPLAUSIBLE_BETA:
+        reasons.append("what stands in the booth does not look like a person")
+    for part in parts:
+        words = part.name.replace("_left", ", left").replace("_right", ", right").replace("_", " ")
+        words = " ".join(reversed(words.split(", ")))
+        enough = _EXTREMITY_SEEN_ENOUGH if part.name.startswith(_EXTREMITIES) else _SEEN_ENOUGH
+        if part.coverage < enough:
+            reasons.append(f"{words} not seen ({100 * part.coverage:.0f} % of it)")
+        elif part.residual_rms_m > _PART_RESIDUAL_M:
+            reasons.append(f"{words} not met ({1e3 * part.residual_rms_m:.0f} mm off)")
+    for camera, shift in camera_shifts_m.items():
+        if shift > _CAMERA_SHIFT_M:
+            reasons.append(
+                f"camera {camera} looks {1e3 * shift:.0f} mm off its calibration; run station check"
+            )
+    return Verdict("rescan" if reasons else "ok", tuple(reasons))
