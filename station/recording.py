@@ -6,6 +6,7 @@ each a one-line header `P5 640 480 65535` and little-endian 16-bit raw 11-bit di
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -33,17 +34,36 @@ class RecordedFrame:
     """(480, 640) raw 11-bit disparity, 2047 = no reading."""
 
 
-def write_recording(folder: Path, frames: Iterable[RecordedFrame]) -> int:
-    """Write a recording, replacing one of the same name; returns how many frames it holds."""
+def write_recording(
+    folder: Path, frames: Iterable[RecordedFrame], *, tick_hz: float, passes: int = 1
+) -> int:
+    """Write a recording, replacing one of the same name; returns how many frames it holds.
+
+    Further passes repeat the frames with times and ticks that go on, as hard links: a minute takes
+    no more disk than its first seconds.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    names = []
-    for number, frame in enumerate(frames):
-        name = f"d-{frame.seconds:.6f}-{frame.ticks}-{number:06d}.pgm"
+    first = []
+    for frame in frames:
+        name = _name(frame.seconds, frame.ticks, len(first))
         (folder / name).write_bytes(_HEADER + frame.raw.astype("<u2").tobytes())
-        names.append(name)
+        first.append((frame.seconds, frame.ticks, name))
+    names = [name for _, _, name in first]
+    span_s = first[-1][0] - first[0][0]
+    period_s = span_s + span_s / max(len(first) - 1, 1)
+    for again in range(1, passes):
+        later_s = again * period_s
+        for seconds, ticks, original in first:
+            name = _name(seconds + later_s, (ticks + round(later_s * tick_hz)) % 2**32, len(names))
+            os.link(folder / original, folder / name)
+            names.append(name)
     (folder / INDEX).write_text("".join(f"{name}\n" for name in names))
     return len(names)
+
+
+def _name(seconds: float, ticks: int, number: int) -> str:
+    return f"d-{seconds:.6f}-{ticks}-{number:06d}.pgm"
 
 
 def check_recording(folder: Path) -> list[tuple[float, int, Path]]:

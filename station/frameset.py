@@ -1,0 +1,75 @@
+"""Matching the frames of several cameras by the time at which they were taken."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+Frame = TypeVar("Frame")
+
+_LONGEST_QUEUE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Frameset(Generic[Frame]):
+    """One frame of every camera, taken within the tolerance."""
+
+    frames: dict[str, Frame]
+    time_s: float
+    """Of its last frame."""
+    spread_s: float
+
+
+class FramesetMatcher(Generic[Frame]):
+    """Builds framesets in order; each frame is used at most once.
+
+    A set is complete when the heads of all queues lie within the tolerance and no camera's next
+    frame would make it tighter; the earliest head is dropped while they do not. Queues are short:
+    a camera that stays behind costs its own frames, never memory.
+    """
+
+    def __init__(self, cameras: Iterable[str], tolerance_s: float) -> None:
+        self._queues: dict[str, deque[tuple[float, Frame]]] = {name: deque() for name in cameras}
+        self._tolerance_s = tolerance_s
+        self.dropped: dict[str, int] = dict.fromkeys(self._queues, 0)
+
+    def push(self, camera: str, time_s: float, frame: Frame) -> list[Frameset[Frame]]:
+        """Add a frame; returns the sets that it completes."""
+        queue = self._queues[camera]
+        if queue and time_s <= queue[-1][0]:
+            # A clock that was reset, or a replay that began anew: what waited is of the past.
+            self.dropped[camera] += len(queue)
+            queue.clear()
+        queue.append((time_s, frame))
+        if len(queue) > _LONGEST_QUEUE:
+            queue.popleft()
+            self.dropped[camera] += 1
+        found = []
+        while all(self._queues.values()):
+            heads = {name: waiting[0][0] for name, waiting in self._queues.items()}
+            earliest = min(heads, key=heads.__getitem__)
+            spread = max(heads.values()) - heads[earliest]
+            if spread <= self._tolerance_s and not self._tighter(earliest, heads, spread):
+                found.append(self._take(heads, spread))
+            else:
+                self._queues[earliest].popleft()
+                self.dropped[earliest] += 1
+        return found
+
+    def clear(self) -> None:
+        """Forget what waits: it belongs to the time before."""
+        for queue in self._queues.values():
+            queue.clear()
+
+    def _tighter(self, earliest: str, heads: dict[str, float], spread: float) -> bool:
+        queue = self._queues[earliest]
+        if len(queue) < 2:
+            return False
+        times = [queue[1][0] if name == earliest else time for name, time in heads.items()]
+        return max(times) - min(times) < spread
+
+    def _take(self, heads: dict[str, float], spread: float) -> Frameset[Frame]:
+        frames = {name: queue.popleft()[1] for name, queue in self._queues.items()}
+        return Frameset(frames, max(heads.values()), spread)
