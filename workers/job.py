@@ -10,9 +10,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+
+from station.bundle import read_bundle
+from station.depth import PointCloud, Preprocessed, preprocess
+from workers.export.result import write_result
+from workers.measure.body import measure_body
+from workers.scape.fit import FitResult, Method, fit_body, sampling_of
+from workers.scape.model import BodyModel, load_model
 
 Progress = Callable[[str, float], None]
-"""Called with the step's name and the share of the whole job that is done, 0 to 1."""
+"""Called with the step's name and the share of it that is done, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,3 +49,74 @@ class Stopwatch:
 
     def total_s(self) -> float:
         return time.monotonic() - self._start_s
+
+
+def warm_up() -> BodyModel:
+    """Load everything that the first job would otherwise wait for."""
+    from station.depth.average import warm_up as compile_average
+
+    model = load_model()
+    sampling_of(model)
+    compile_average()
+    return model
+
+
+def reconstruct_bundle(
+    bundle_folder: Path,
+    out_folder: Path,
+    *,
+    method: Method = "joint",
+    model: BodyModel | None = None,
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
+) -> JobSummary:
+    """Reconstruct a scan bundle into a folder that exists and is empty.
+
+    Raises:
+        BoothError: the bundle cannot be used; one line says why.
+    """
+    watch = Stopwatch()
+    progress("loading", 0.0)
+    with watch.step("load"):
+        bundle = read_bundle(bundle_folder)
+        model = model or load_model()
+    progress("filtering", 0.0)
+    with watch.step("preprocess"):
+        scan = preprocess(bundle)
+    fit = fit_body(model, scan, method=method, progress=progress)
+    return _finish(model, fit, scan.cloud, bundle.scan_id, method, out_folder, watch, progress)
+
+
+def reconstruct_cloud(
+    cloud: PointCloud,
+    scan_id: str,
+    out_folder: Path,
+    *,
+    method: Method = "joint",
+    model: BodyModel | None = None,
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
+) -> JobSummary:
+    """Reconstruct a bare cloud, from any scanner."""
+    watch = Stopwatch()
+    with watch.step("load"):
+        model = model or load_model()
+    fit = fit_body(model, Preprocessed(cloud, (), ()), method=method, progress=progress)
+    return _finish(model, fit, cloud, scan_id, method, out_folder, watch, progress)
+
+
+def _finish(
+    model: BodyModel,
+    fit: FitResult,
+    cloud: PointCloud,
+    scan_id: str,
+    method: Method,
+    out_folder: Path,
+    watch: Stopwatch,
+    progress: Progress,
+) -> JobSummary:
+    watch.seconds.update(fit.seconds)
+    progress("measuring", 0.0)
+    with watch.step("measure"):
+        measurements = measure_body(model, fit.vertices, fit.vertex_sigma_m)
+    progress("writing", 0.0)
+    write_result(out_folder, model, fit, cloud, measurements, scan_id, method, watch)
+    return JobSummary(fit.verdict.status, fit.verdict.reasons)

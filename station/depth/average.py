@@ -93,3 +93,8 @@ def _average(stack, scale, least, third, depth, count, change):  # type: ignore[
             count[y, x] = kept
             if early_count > 0 and late_count > 0:
                 change[y, x] = late / late_count - early / early_count
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) what the first scan would otherwise wait for."""
+    average(np.zeros((3, 2, 2), np.uint16), 1e-4)

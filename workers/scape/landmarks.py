@@ -103,14 +103,12 @@ def _limbs(t: _Template, side: str, sign: float) -> dict[str, int]:
     forearm_axis /= np.linalg.norm(forearm_axis)
     wrist_end = fore[np.argsort(v[fore] @ forearm_axis)[-60:]]
     ulnar = (sign * 0.3, 0.8, -0.5)
-    arm_axis = elbow - v[t.of("chest")].mean(axis=0)
-    near_shoulder = np.concatenate([upper, part("shoulder"), t.of("chest")])
-    top = near_shoulder[
-        np.abs(v[near_shoulder, 0]) > np.quantile(np.abs(v[upper, 0]), 0.02) - 0.015
+    inner = np.quantile(np.abs(v[upper, 0]), 0.02)
+    shoulder = np.concatenate([upper, part("shoulder"), t.of("chest")])
+    shoulder = shoulder[
+        (v[shoulder, 0] * sign > inner + 0.02) & (v[shoulder, 0] * sign < inner + 0.045)
     ]
-    top = top[np.abs(v[top, 0]) < np.quantile(np.abs(v[upper, 0]), 0.15)]
-    top = top[v[top, 0] * sign > 0]
-    acromion = t.extreme(top, (0.3 * sign, 0, 1))
+    acromion = t.extreme(shoulder, (0, 0, 1))
     knee_z = 0.5 * (v[thigh, 2].min() + v[shin, 2].max())
     knee = t.near_level(np.concatenate([thigh, shin]), knee_z, 0.02)
     calf = t.near_level(shin, knee_z - 0.13, 0.05)
@@ -120,18 +118,16 @@ def _limbs(t: _Template, side: str, sign: float) -> dict[str, int]:
     fingers = part("fingers")
     neck_side = t.of("neck", "chest")
     low_neck = t.near_level(neck_side, v[t.of("neck"), 2].min() + 0.035, 0.02)
-    armpit = np.concatenate([upper, t.of("chest")])
-    armpit = armpit[v[armpit, 0] * sign > 0]
-    axis_x = np.quantile(np.abs(v[upper, 0]), 0.03)
-    armpit = armpit[np.abs(np.abs(v[armpit, 0]) - axis_x) < 0.025]
-    del arm_axis
+    armpit = t.extreme(upper, (-sign, 0, -0.6))
+    around = np.concatenate([upper, t.of("chest")])
+    fold = around[np.linalg.norm((v[around] - v[armpit])[:, [0, 2]], axis=1) < 0.035]
     hips = t.of("pelvis", "abdomen")
     return {
         "side_neck": t.extreme(low_neck, outward),
         "acromion": acromion,
-        "armpit": t.extreme(armpit, (0, 0, -1)),
-        "armpit_front": t.extreme(armpit, (0, -0.8, -0.6)),
-        "armpit_back": t.extreme(armpit, (0, 0.8, -0.6)),
+        "armpit": armpit,
+        "armpit_front": t.extreme(fold, (0, -1, 0)),
+        "armpit_back": t.extreme(fold, (0, 1, 0)),
         "elbow": t.extreme(at_elbow, (sign * 0.25, 0.95, 0.1)),
         "wrist": t.extreme(wrist_end, ulnar),
         "fingertip": t.extreme(fingers, tuple(forearm_axis)),

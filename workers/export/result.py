@@ -1,0 +1,128 @@
+"""The result folder: everything in it, and result.json with the hash of each file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from station import __version__
+from station.depth import PointCloud
+from workers.export.meshes import glb_mesh, obj_mesh, ply_cloud, ply_mesh
+from workers.export.preview import preview
+from workers.measure.body import Measurement
+from workers.scape.fit import FitResult
+from workers.scape.model import BodyModel
+
+if TYPE_CHECKING:
+    from workers.job import Stopwatch
+
+_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "opencv-contrib-python-headless", "cholespy")
+
+
+def write_result(
+    folder: Path,
+    model: BodyModel,
+    fit: FitResult,
+    cloud: PointCloud,
+    measurements: Sequence[Measurement],
+    scan_id: str,
+    method: str,
+    watch: Stopwatch,
+) -> None:
+    """Write a result's files into an existing folder; publishing it is the caller's."""
+    with watch.step("export"):
+        faces = model.faces
+        files = {
+            "mesh.ply": ply_mesh(fit.vertices, faces),
+            "mesh.obj": obj_mesh(fit.vertices, faces),
+            "mesh.glb": glb_mesh(fit.vertices, faces, measurements),
+            "cloud.ply": ply_cloud(cloud.points, cloud.normals),
+            "measurements.json": _json(measurements_document(scan_id, measurements)),
+            "preview.png": preview(fit.vertices, faces, measurements),
+        }
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    seconds = {**watch.seconds, "total": watch.total_s()}
+    document = result_document(model, fit, scan_id, method, seconds, hashes)
+    (folder / "result.json").write_bytes(_json(document))
+
+
+def measurements_document(scan_id: str, measurements: Sequence[Measurement]) -> dict[str, Any]:
+    """measurements.json, format "booth-measurements", version 1."""
+    return {
+        "format": "booth-measurements",
+        "version": 1,
+        "scan_id": scan_id,
+        "pose": "as-scanned",
+        "measurements": [
+            {
+                "name": row.name,
+                "standard": row.standard,
+                "value_m": row.value_m,
+                "interval95_m": list(row.interval95_m),
+                "path": np.round(row.path, 5).tolist(),
+                "closed": row.closed,
+            }
+            for row in measurements
+        ],
+    }
+
+
+def result_document(
+    model: BodyModel,
+    fit: FitResult,
+    scan_id: str,
+    method: str,
+    seconds: dict[str, float],
+    hashes: dict[str, str],
+) -> dict[str, Any]:
+    """result.json, format "booth-result", version 1."""
+    twists = model.relative_twists(fit.state.rotations)
+    return {
+        "format": "booth-result",
+        "version": 1,
+        "scan_id": scan_id,
+        "status": fit.verdict.status,
+        "reasons": list(fit.verdict.reasons),
+        "method": method,
+        "model": {"name": model.name, "sha256": model.sha256},
+        "shape": fit.state.beta.tolist(),
+        "pose": dict(zip(model.part_names, twists.tolist(), strict=True)),
+        "translation": fit.state.translation.tolist(),
+        "quality": {
+            "point_to_surface_rms_m": fit.point_to_surface_rms_m,
+            "coverage": fit.coverage,
+            "correspondences": fit.correspondences,
+            "parts": {
+                part.name: {
+                    "coverage": part.coverage,
+                    "residual_rms_m": part.residual_rms_m
+                    if np.isfinite(part.residual_rms_m)
+                    else None,
+                }
+                for part in fit.parts
+            },
+            "camera_shifts_m": fit.camera_shifts_m,
+        },
+        "iterations": fit.iterations,
+        "seconds": seconds,
+        "versions": {
+            "body-booth": __version__,
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in _LIBRARIES},
+        },
+        "files": hashes,
+    }
+
+
+def _json(document: dict[str, Any]) -> bytes:
+    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
+    return (text + "\n").encode()
