@@ -13,8 +13,6 @@ import msgpack
 
 from station.errors import FormatError
 
-MAX_HEADER_BYTES = 1 << 20
-
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -35,7 +33,7 @@ class Message:
             FormatError: it is torn, of another type or of another version.
         """
         try:
-            content = msgpack.unpackb(data, max_buffer_size=MAX_HEADER_BYTES)
+            content = msgpack.unpackb(data)
         except (ValueError, msgpack.UnpackException) as cause:
             raise FormatError(f"a message is torn ({cause})") from None
         if not isinstance(content, dict) or content.get("type") != cls.__name__:
