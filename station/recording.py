@@ -44,7 +44,7 @@ def write_recording(
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    first = []
+    first: list[tuple[float, int, str]] = []
     for frame in frames:
         name = _name(frame.seconds, frame.ticks, len(first))
         (folder / name).write_bytes(_HEADER + frame.raw.astype("<u2").tobytes())

@@ -51,3 +51,17 @@ def read_cloud(path: Path, up: str) -> PointCloud:
         camera=np.zeros(len(points), np.int16),
         camera_names=("cloud",),
     )
+
+
+def read_mesh_vertices(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """The vertices (n, 3) of a mesh file.
+
+    Raises:
+        InputError: the file is missing, is no mesh, or holds no numbers.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} is not a file; give a result folder or a mesh")
+    vertices = np.asarray(o3d.io.read_triangle_mesh(path).vertices)
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise InputError(f"{path} holds no usable mesh")
+    return vertices

@@ -157,14 +157,14 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     smooth = cv2.bilateralFilter(
         part,
         _BILATERAL_DIAMETER_PX,
-        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.float64(typical))),
+        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical))),
         _BILATERAL_SPACE_PX,
     )
     smooth[part == 0] = 0.0
     image = np.zeros_like(depth)
     image[window] = smooth
     points = camera_points(calibration, image)[window]
-    directions, valid = normals(points, smooth)
+    directions, valid = normals(points, image[window])
     distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
     cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
     valid &= near[window] & ~edge & (cosine > _MAX_INCIDENCE_COSINE)
@@ -225,9 +225,8 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
 
 
 def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
-    person = np.zeros(camera.depth_m.size, bool)
-    person[camera.pixels[keep]] = True
-    person = person.reshape(camera.depth_m.shape)
+    person = np.zeros(camera.depth_m.shape, bool)
+    person.flat[camera.pixels[keep]] = True
     # Pixels at the person's edge are neither: no reading there says what lies behind.
     near_person = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     view = CameraView(

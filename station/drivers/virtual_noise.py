@@ -68,10 +68,9 @@ def observe(view: TrueView, unit: UnitError, rng: np.random.Generator) -> NDArra
     """One noisy raw 11-bit frame (h, w) of what a perfect sensor would see."""
     depth = unit.apply(view.depth_m)
     seen = (depth > 0) & view.lit & view.reflects
-    noise = cv2.GaussianBlur(
-        rng.standard_normal(depth.shape, dtype=np.float32), (_WINDOW_PX, _WINDOW_PX), 1.6
-    )
-    noise /= max(float(noise.std()), 1e-6)
+    white = rng.standard_normal(depth.shape, dtype=np.float32)
+    blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
+    noise = blurred / max(float(blurred.std()), 1e-6)
     grazing = np.cos(np.minimum(view.incidence_rad, _FADE_END_RAD))
     sigma = _RANDOM_COEFFICIENT * np.square(depth) / np.sqrt(np.maximum(grazing, 0.2))
     measured = np.where(seen, depth + sigma * noise, 0.0).astype(np.float32)

@@ -30,6 +30,8 @@ def hull_loop(points: Array, normal: Array) -> Array:
     x = np.cross(normal, (0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0))
     x /= np.linalg.norm(x)
     y = np.cross(normal, x)
+    if len(points) < 3:
+        raise ValueError("the plane does not cut this part of the body")
     try:
         hull = ConvexHull(np.stack([points @ x, points @ y], axis=1))
     except QhullError:

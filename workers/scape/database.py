@@ -200,12 +200,11 @@ class BodyDatabase:
         """
         rng = np.random.default_rng((seed, _SPLIT_SEEDS[split]))
         candidates = self._candidates(rng, 4 * count)
-        stature = np.concatenate(
-            [
-                np.ptp(self.vertices(candidates.take(np.arange(i, min(i + 256, 4 * count))))[..., 2], axis=1)
-                for i in range(0, 4 * count, 256)
-            ]
-        )  # fmt: skip
+        statures = []
+        for start in range(0, 4 * count, 256):
+            piece = candidates.take(np.arange(start, min(start + 256, 4 * count)))
+            statures.append(np.ptp(self.vertices(piece)[..., 2], axis=1))
+        stature = np.concatenate(statures)
         female = candidates.phenotypes["gender"] > 0.5
         mean = np.where(female, 1.62, 1.75)
         deviation = np.where(female, 0.065, 0.07) * 1.5
@@ -280,9 +279,9 @@ class BodyDatabase:
             turn(f"upperarm01.{side}", 2, spread(8.0))
             # The neutral elbow is bent by 44 degrees; a negative bend straightens it.
             bend = np.radians(rng.uniform(-48.0, 20.0, count))
-            axis = np.array([0.7, sign * 0.15, sign * 0.7])
+            elbow_axis = np.array([0.7, sign * 0.15, sign * 0.7])
             for i in range(3):
-                turn(f"lowerarm01.{side}", i, -axis[i] * bend)
+                turn(f"lowerarm01.{side}", i, -elbow_axis[i] * bend)
             twist = spread(20.0)
             along = np.array([sign * 0.55, -0.5, -0.65])
             for i in range(3):

@@ -30,7 +30,7 @@ def triangle_areas(vertices: Array, faces: Faces) -> Array:
 def vertex_areas(vertices: Array, faces: Faces) -> Array:
     """A third of the areas of the triangles around each vertex, (P,) in square metres."""
     thirds = np.repeat(triangle_areas(vertices, faces) / 3.0, 3)
-    return np.bincount(faces.ravel(), thirds, minlength=len(vertices))
+    return np.asarray(np.bincount(faces.ravel(), thirds, minlength=len(vertices)), np.float64)
 
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:

@@ -64,7 +64,7 @@ def fit_body(
     scan: Preprocessed,
     *,
     method: Method = "joint",
-    progress: Progress = lambda step, share: None,
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
 ) -> FitResult:
     """Fit the model to a preprocessed scan.
 

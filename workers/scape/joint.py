@@ -119,7 +119,7 @@ def fit_jointly(
     target: Target,
     state: BodyState,
     schedule: tuple[Stage, ...] = SCHEDULE,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
@@ -180,10 +180,9 @@ def _data_terms(
     outer = (direction[:, :, None] * direction[:, None, :]).reshape(-1, 9)
     for column in range(9):
         weight[:, column] = np.bincount(sample, row_weight * outer[:, column], samples)
-    pull = np.stack(
-        [np.bincount(sample, row_weight * residual * direction[:, i], samples) for i in range(3)],
-        axis=1,
-    )
+    pull: Array = np.zeros((samples, 3))
+    for i in range(3):
+        pull[:, i] = np.bincount(sample, row_weight * residual * direction[:, i], samples)
     return weight.reshape(-1, 3, 3), pull, len(residual)
 
 

@@ -187,7 +187,11 @@ class BodyModel:
         """
         surface = self.unturned(vertices, state.rotations)
         change = self.neutral_surface(new_state) - self.neutral_surface(state)
-        return self.turned(surface + change, new_state.rotations, new_state.translation)
+        found = self.turned(surface + change, new_state.rotations, new_state.translation)
+        # Blended rotations cannot be undone exactly; what is left over turns with its part.
+        left = vertices - self.turned(surface, state.rotations, self.anchor @ vertices)
+        turns = new_state.rotations @ np.swapaxes(state.rotations, 1, 2)
+        return np.asarray(found + np.einsum("pij,pj->pi", turns[self.part_of_vertex], left))
 
     def part_rotations(self, surface: Array, vertices: Array) -> Array:
         """(L, 3, 3): the rotations that take the parts of a neutral surface to a posed one."""

@@ -39,7 +39,7 @@ def fit_like_the_paper(
     model: BodyModel,
     target: Target,
     state: BodyState,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
 ) -> tuple[SurfaceFit, BodyState, int]:
     """The paper's loop; returns the surface, the last state and how often it went round."""
     mesh = model.vertices(state)

@@ -98,8 +98,8 @@ def _gathered(
     distance = np.einsum("ni,ni->n", normals[vertex], offsets)
     information = _INDEPENDENT / np.maximum(sigma_m[kept], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
-    weight = np.bincount(vertex, information, count)
-    total = np.bincount(vertex, information * distance, count)
+    weight: Array = np.bincount(vertex, information, count).astype(np.float64)
+    total: Array = np.bincount(vertex, information * distance, count).astype(np.float64)
     return total / np.maximum(weight, 1e-12), weight
 
 

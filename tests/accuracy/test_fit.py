@@ -1,0 +1,66 @@
+"""The fit on a body that the model was not trained on, seen through the simulated sensors."""
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from station.bundle import read_bundle
+from station.depth import preprocess
+from workers.scape.fit import FitResult, fit_body
+from workers.scape.model import BodyModel, load_model
+
+BODIES = Path(__file__).parents[2] / "station/data/bodies"
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def fitted(model: BodyModel, bundle: Path) -> FitResult:
+    return fit_body(model, preprocess(read_bundle(bundle)))
+
+
+def _distance_to(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+    )
+    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
+
+
+def test_the_cloud_lies_on_the_body(bundle: Path) -> None:
+    cloud = preprocess(read_bundle(bundle)).cloud
+    body = np.load(BODIES / "ben.npz")
+    away = _distance_to(body["vertices"], body["faces"], cloud.points)
+    assert np.sqrt(np.mean(away**2)) < 0.002
+
+
+def test_the_fit_lies_on_the_body(model: BodyModel, fitted: FitResult) -> None:
+    truth = np.load(BODIES / "ben.npz")["vertices"]
+    away = _distance_to(fitted.vertices, model.faces, truth)
+    names = np.array(model.part_names)[model.part_of_vertex]
+    extremity = np.array([n.startswith(("hand", "thumb", "fingers", "foot")) for n in names])
+    assert np.sqrt(np.mean(away[~extremity] ** 2)) < 0.003
+    assert abs(np.ptp(fitted.vertices[:, 2]) - np.ptp(truth[:, 2])) < 0.01
+
+
+def test_the_mesh_is_watertight_and_not_folded(model: BodyModel, fitted: FitResult) -> None:
+    edges = np.sort(model.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 2).all()
+    assert np.isfinite(fitted.vertices).all()
+
+
+def test_same_input_same_output(model: BodyModel, bundle: Path, fitted: FitResult) -> None:
+    again = fit_body(model, preprocess(read_bundle(bundle)))
+    assert again.vertices.tobytes() == fitted.vertices.tobytes()
+
+
+def test_the_paper_method_gives_a_body_too(model: BodyModel, bundle: Path) -> None:
+    result = fit_body(model, preprocess(read_bundle(bundle)), method="paper")
+    truth = np.load(BODIES / "ben.npz")["vertices"]
+    assert np.sqrt(np.mean(_distance_to(result.vertices, model.faces, truth) ** 2)) < 0.09

@@ -1,0 +1,59 @@
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from station.frameset import FramesetMatcher
+
+_CAMERAS = ("a", "b", "c", "d")
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    phases=st.lists(st.floats(0.0, 1 / 30), min_size=4, max_size=4),
+    lost=st.sets(st.tuples(st.integers(0, 3), st.integers(0, 59)), max_size=30),
+)
+def test_sets_are_tight_ordered_and_use_each_frame_once(
+    phases: list[float], lost: set[tuple[int, int]]
+) -> None:
+    matcher: FramesetMatcher[tuple[int, int]] = FramesetMatcher(_CAMERAS, 0.025)
+    frames = sorted(
+        (phases[camera] + index / 30, camera, index)
+        for camera in range(4)
+        for index in range(60)
+        if (camera, index) not in lost
+    )
+    sets = [
+        found
+        for time_s, camera, index in frames
+        for found in matcher.push(_CAMERAS[camera], time_s, (camera, index))
+    ]
+    used = [frame for found in sets for frame in found.frames.values()]
+    assert len(used) == len(set(used))
+    assert all(found.spread_s <= 0.025 for found in sets)
+    assert [found.time_s for found in sets] == sorted(found.time_s for found in sets)
+    if not lost:
+        assert len(sets) >= 58
+
+
+def test_every_phase_state_gives_sets() -> None:
+    """A tolerance of 10 ms would give sets in one phase state of nine."""
+    matcher: FramesetMatcher[int] = FramesetMatcher(_CAMERAS, 0.025)
+    found = 0
+    for index in range(30):
+        for camera, phase in zip(_CAMERAS, (0.0, 0.0083, 0.0167, 0.025), strict=True):
+            found += len(matcher.push(camera, index / 30 + phase, index))
+    assert found >= 29
+
+
+def test_a_silent_camera_costs_no_memory() -> None:
+    matcher: FramesetMatcher[int] = FramesetMatcher(_CAMERAS, 0.025)
+    for index in range(10_000):
+        assert matcher.push("a", index / 30, index) == []
+    assert matcher.dropped["a"] > 9_000
+
+
+def test_a_clock_that_jumps_back_starts_anew() -> None:
+    """A replayed recording once blocked the queue with frames of the future."""
+    matcher: FramesetMatcher[int] = FramesetMatcher(("a", "b"), 0.025)
+    matcher.push("a", 100.0, 0)
+    assert matcher.push("a", 1.0, 1) == []
+    assert len(matcher.push("b", 1.01, 2)) == 1

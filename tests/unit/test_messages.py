@@ -1,0 +1,39 @@
+import msgpack
+import pytest
+
+from station.errors import FormatError
+from station.messages import CameraHealth, DesiredState, Reply, Request, ScanEvent
+
+_EXAMPLES = [
+    CameraHealth("front", "lost", "unplugged", 10, 1, 0),
+    DesiredState(True),
+    Request("scan", "20260101T000000Z-0001", "Zoë"),
+    Reply(ok=False, error="no", content={"a": [1, 2]}),
+    ScanEvent("s", "capturing", 3, 10, ""),
+]
+
+
+@pytest.mark.parametrize("message", _EXAMPLES, ids=lambda message: type(message).__name__)
+def test_round_trip(message: Request) -> None:
+    assert type(message).unpack(message.pack()) == message
+
+
+def _changed(**changes: object) -> bytes:
+    content = msgpack.unpackb(Request("scan").pack())
+    packed: bytes = msgpack.packb({**content, **changes})
+    return packed
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\xc1", "torn"),
+        (msgpack.packb([1]), "expected"),
+        (DesiredState(True).pack(), "'DesiredState' came"),
+        (_changed(version=2), "run the same release"),
+        (_changed(extra=1), "fields"),
+    ],
+)
+def test_a_stranger_is_refused_with_words(data: bytes, words: str) -> None:
+    with pytest.raises(FormatError, match=words):
+        Request.unpack(data)

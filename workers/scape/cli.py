@@ -1,0 +1,52 @@
+"""`reconstruct train` and `reconstruct evaluate-model`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
+)
+@click.option("--seed", default=0, show_default=True, help="the same seed learns the same model")
+@click.option("--bodies", default=3000, show_default=True, help="training bodies")
+@click.option("--poses", default=1200, show_default=True, help="training poses")
+@click.option("--components", default=130, show_default=True, help="shape components kept")
+def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> None:
+    """Build the database and learn the body model (minutes; needs the train extra).
+
+    \b
+    Examples:
+      reconstruct train --out workers/scape/data/body.npz
+      reconstruct train --out small.npz --bodies 300 --poses 100 --components 40
+    """
+    from workers.scape.train import TrainingPlan
+    from workers.scape.train import train as learn
+
+    def show(step: str, share: float) -> None:
+        click.echo(f"{100 * share:3.0f} %  {step}")
+
+    learn(out, TrainingPlan(bodies, poses, components, seed), show)
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+@click.command()
+@click.option("--model", "path", type=click.Path(path_type=Path), help="the shipped one if absent")
+@click.option("--bodies", default=100, show_default=True, help="held-out bodies")
+@click.option("--seed", default=0, show_default=True)
+def evaluate_model(path: Path | None, bodies: int, seed: int) -> None:
+    """Test the model on bodies and poses that it was not learned from (needs the train extra).
+
+    \b
+    Examples:
+      reconstruct evaluate-model
+      reconstruct evaluate-model --model small.npz --bodies 20
+    """
+    from workers.scape.evaluate import evaluate
+    from workers.scape.model import load_model
+
+    for line in evaluate(load_model(path), bodies, seed):
+        click.echo(line)
