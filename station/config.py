@@ -60,8 +60,8 @@ class CameraConfig(_Strict):
 class VolumeConfig(_Strict):
     """The part of the world in which a body is looked for, metres."""
 
-    min_m: Metres3 = (-0.75, -0.60, 0.0)
-    max_m: Metres3 = (0.75, 0.60, 2.20)
+    min_m: Metres3 = (-0.95, -0.75, 0.0)
+    max_m: Metres3 = (0.95, 0.75, 2.2)
     floor_clearance_m: float = Field(
         default=0.012, ge=0.0, le=0.1, description="points lower than this are floor"
     )

@@ -69,3 +69,10 @@ def test_an_unknown_camera_is_named(tmp_path: Path) -> None:
     path.write_text(_CAMERA)
     with pytest.raises(ConfigError, match="camera rear is not in the configuration"):
         load_config(path).camera("rear")
+
+
+def test_the_example_is_a_booth() -> None:
+    example = Path(__file__).parents[2] / "deploy/booth.example.toml"
+    config = load_config(example)
+    assert len(config.cameras) == 4
+    assert config.volume.max_m == (0.95, 0.75, 2.2)

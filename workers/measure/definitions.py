@@ -105,8 +105,8 @@ DEFINITIONS: tuple[Definition, ...] = (
     Definition("knee_height", "kneecap's middle above the floor", "height", ("knee_left",)),
     Definition("head_girth", "around brow and back of the head", "girth", ("glabella",), ("head",)),
     Definition(
-        "neck_girth", "midway up the neck, square to it", "girth", ("cervicale", "chin"),
-        ("neck", "head", "chest"), ("suprasternale", "chin"), 0.35, "ISO 8559-1:2017 5.3.2",
+        "neck_girth", "level, at the middle of the neck", "girth", ("cervicale", "chin"),
+        ("neck", "head"), None, 0.5, "ISO 8559-1:2017 5.3.2",
     ),
     Definition(
         "chest_girth", "at the bust points", "girth", ("bust_left", "bust_right"), TRUNK,
