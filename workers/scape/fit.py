@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from station.depth import PointCloud, Preprocessed
 from station.errors import InputError
@@ -28,7 +29,8 @@ Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
 _PULLED_POINTS = 5000
-_COARSE_POINTS = 1200
+_COARSE_POINTS = 800
+_SCOUT_SAMPLES = 250
 _CAMERA_POINTS = 400
 
 
@@ -71,15 +73,21 @@ def fit_body(
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
+    _refuse_absurd(scan.cloud)
+    # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _fit(model, scan, method, progress)
+
+
+def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progress) -> FitResult:
     cloud = scan.cloud
-    _refuse_absurd(cloud)
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
-    coarse, _ = sampling.stage(600)
+    scout, _ = sampling.stage(_SCOUT_SAMPLES)
     pulled = _even_subset(len(cloud), _PULLED_POINTS)
     target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
-    state = initial_state(model, coarse, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    state = initial_state(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
     aligned = time.monotonic()
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree, compatible
 from workers.scape.deformation import vertex_areas, vertex_normals
-from workers.scape.model import BodyModel, BodyState, SampledBody
+from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
 
 Array = NDArray[np.float64]
 
@@ -123,7 +123,7 @@ def fit_jointly(
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
-    covariance = np.eye(1)
+    information = np.eye(1)
     used = 0
     for step, stage in enumerate(schedule):
         body, sample_of_vertex = sampling.stage(stage.samples)
@@ -131,8 +131,9 @@ def fit_jointly(
         weight, pull, used = _data_terms(
             model, target, vertices, stage, sample_of_vertex, len(body.indices)
         )
-        state, covariance = _step(model, body, state, stage, weight, pull, prior)
+        state, information = _step(model, body, state, stage, weight, pull, prior)
         progress((step + 1) / len(schedule))
+    covariance = scipy.linalg.inv(information)
     return JointResult(state, model.vertices(state), covariance, used, len(schedule))
 
 
@@ -147,11 +148,11 @@ def _data_terms(
     """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3), and the number of rows."""
     normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
-    pulled = target.pulled
+    pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
     mine = OrientedTree.build(vertices, normals).nearest(
         cloud.points[pulled], cloud.normals[pulled]
     )
-    stride = max(1, len(vertices) // 4000)
+    stride = max(1, len(vertices) // (2 * stage.samples))
     asking = np.arange(0, len(vertices), stride)
     found = cloud.nearest(vertices[asking], normals[asking])
     vertex = np.concatenate([mine, asking])
@@ -220,20 +221,19 @@ def _step(
     pull: Array,
     prior: _TwistPrior,
 ) -> tuple[BodyState, Array]:
-    """One Gauss-Newton step; returns the new state and the posterior covariance (D, D)."""
-    parts, shapes = model.part_count, model.beta_count
-    active = min(stage.components, shapes)
-    _, derivative = body.jacobian(state)
-    columns = np.r_[np.arange(3 * parts + active), 3 * parts + shapes + np.arange(3)]
-    rows = derivative[:, :, columns].astype(np.float32)
-    weighted = np.einsum("nij,njd->nid", weight.astype(np.float32), rows)
-    size = len(columns)
+    """One Gauss-Newton step; returns the new state and its normal matrix (D, D)."""
+    parts = model.part_count
+    active = min(stage.components, model.beta_count)
+    _, rows = body.jacobian(state, active)
+    size = rows.shape[2]
+    weighted = weight.astype(np.float32) @ rows
     normal = (rows.reshape(-1, size).T @ weighted.reshape(-1, size)).astype(np.float64)
-    gradient = np.einsum("nid,ni->d", rows, pull)
+    gradient = (pull.ravel().astype(np.float32) @ rows.reshape(-1, size)).astype(np.float64)
     shape = slice(3 * parts, 3 * parts + active)
     normal[shape, shape] += np.eye(active)
     gradient[shape] -= state.beta[:active]
-    change, twists = _twist_jacobian(model, state)
+    change = twist_chain(model, state.rotations)
+    twists = model.relative_twists(state.rotations)[1:].ravel()
     normal[: 3 * parts, : 3 * parts] += change.T @ prior.information @ change
     gradient[: 3 * parts] -= change.T @ prior.information @ (twists - prior.mean)
     normal[np.diag_indices_from(normal)] += 1e-6 * np.trace(normal) / size
@@ -243,18 +243,4 @@ def _step(
     beta = state.beta.copy()
     beta[:active] += delta[shape]
     new = BodyState(so3_exp(turned) @ state.rotations, beta, state.translation + delta[-3:])
-    return new, scipy.linalg.cho_solve(factor, np.eye(size))
-
-
-def _twist_jacobian(model: BodyModel, state: BodyState) -> tuple[Array, Array]:
-    """Change of the relative twists (3 (L - 1), 3 L) with the parts' turns, and the twists."""
-    parts = model.part_count
-    change = np.zeros((3 * (parts - 1), 3 * parts))
-    for part, parent in enumerate(model.part_parents):
-        if parent < 0:
-            continue
-        back = state.rotations[parent].T
-        row = slice(3 * (part - 1), 3 * part)
-        change[row, 3 * part : 3 * part + 3] = back
-        change[row, 3 * parent : 3 * parent + 3] = -back
-    return change, model.relative_twists(state.rotations)[1:].ravel()
+    return new, normal

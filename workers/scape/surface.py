@@ -34,6 +34,8 @@ _FADE = 2e-4
 _INDEPENDENT = 0.25
 """Share of a vertex' readings that count as independent: matching windows overlap."""
 _LEAST_SIGMA_M = 3e-4
+_MOST_POINTS = 90_000
+"""More add nothing beyond what neighbouring readings share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class SurfaceFit:
     sigma_m: Array
     """(P,): posterior standard deviation along the normal."""
     seen: NDArray[np.bool_]
-    """(P,): points lie on the vertex' own neighbourhood."""
+    """(P,): points lie on the vertex or on a neighbour of it."""
     residual_m: Array
     """(P,): mean signed distance of its points after the fit; NaN where there are none."""
 
@@ -53,6 +55,8 @@ def fit_surface(
     model: BodyModel, vertices: Array, cloud: OrientedTree, sigma_m: Array
 ) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
+    every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
+    points, directions, noise = cloud.points[every], cloud.normals[every], sigma_m[every]
     laplacian = model.solver.laplacian
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
@@ -60,7 +64,7 @@ def fit_surface(
     residual = np.zeros(len(vertices))
     for gate_m, angle_rad, stiffness in _ROUNDS:
         normals = vertex_normals(current, model.faces)
-        residual, weight = _gathered(current, normals, cloud, sigma_m, gate_m, angle_rad)
+        residual, weight = _gathered(current, normals, points, directions, noise, gate_m, angle_rad)
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
         matrix = sp.diags(weight) + bending * (laplacian + _FADE * identity)
         step, _ = cg(
@@ -69,28 +73,30 @@ def fit_surface(
         step *= _hold(model, current, normals, step)
         current = current + step[:, None] * normals
     normals = vertex_normals(current, model.faces)
-    residual, weight = _gathered(current, normals, cloud, sigma_m, _ROUNDS[-1][0], np.radians(40))
-    seen = weight > 0
+    residual, weight = _gathered(current, normals, points, directions, noise, *_ROUNDS[-1][:2])
+    # A vertex between others that have points is seen as well: the template is finer than pixels.
+    seen = (abs(laplacian) @ weight) > 0
     return SurfaceFit(
-        current, _posterior_sigma(model, weight), seen, np.where(seen, residual, np.nan)
+        current, _posterior_sigma(model, weight), seen, np.where(weight > 0, residual, np.nan)
     )
 
 
 def _gathered(
     vertices: Array,
     normals: Array,
-    cloud: OrientedTree,
+    points: Array,
+    directions: Array,
     sigma_m: Array,
     gate_m: float,
     angle_rad: float,
 ) -> tuple[Array, Array]:
     """Each vertex' mean distance (P,) to its points along the normal, and its information."""
-    vertex = OrientedTree.build(vertices, normals).nearest(cloud.points, cloud.normals)
-    offsets = cloud.points - vertices[vertex]
+    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
+    offsets = points - vertices[vertex]
     kept = compatible(
         offsets,
         normals[vertex],
-        cloud.normals,
+        directions,
         max_distance_m=gate_m,
         max_angle_rad=angle_rad,
     )

@@ -23,7 +23,8 @@ _UNEXPLAINED_M = 0.03
 _CAMERA_SHIFT_M = 0.005
 _STATURE_M = (1.30, 2.25)
 _IMPLAUSIBLE_BETA = 6.0
-_EXTREMITIES = ("hand", "thumb", "fingers", "foot", "shoulder", "neck")
+_HAND = ("hand", "thumb", "fingers")
+_EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +60,26 @@ def report_parts(
     unexplained = np.linalg.norm(offsets, axis=1) > _UNEXPLAINED_M
     part = model.part_of_vertex
     reports = []
-    for index, name in enumerate(model.part_names):
-        mine = part == index
+    for name, members in _groups(model).items():
+        mine = np.isin(part, members)
         if not mine.any():
             continue
-        own = (part[vertex] == index) & ~unexplained
+        own = np.isin(part[vertex], members) & ~unexplained
         rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
         coverage = float(areas[mine & seen].sum() / areas[mine].sum())
         reports.append(PartReport(name, coverage, rms))
     rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
     return tuple(reports), rms, float(unexplained.mean())
+
+
+def _groups(model: BodyModel) -> dict[str, list[int]]:
+    """Parts as the operator names them: a hand with its fingers is one."""
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(model.part_names):
+        stem, _, side = name.rpartition("_")
+        key = f"hand_{side}" if stem in _HAND else name
+        groups.setdefault(key, []).append(index)
+    return groups
 
 
 def judge(
@@ -91,8 +102,8 @@ def judge(
     if float(np.abs(beta[:10]).max(initial=0.0)) > _IMPLAUSIBLE_BETA:
         reasons.append("what stands in the booth does not look like a person")
     for part in parts:
-        words = part.name.replace("_left", ", left").replace("_right", ", right").replace("_", " ")
-        words = " ".join(reversed(words.split(", ")))
+        stem, _, side = part.name.rpartition("_")
+        words = f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part.name
         enough = _EXTREMITY_SEEN_ENOUGH if part.name.startswith(_EXTREMITIES) else _SEEN_ENOUGH
         if part.coverage < enough:
             reasons.append(f"{words} not seen ({100 * part.coverage:.0f} % of it)")
