@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-preprocess bench-fit bench-measure bench-calibration
+BENCHES := bench-capture bench-preprocess bench-fit
 
 .PHONY: help demo test check format train clean $(BENCHES)
 
@@ -32,10 +32,9 @@ format: $(VENV)/dev.stamp
 train: $(VENV)/train.stamp
 	$(BIN)/reconstruct train --out workers/scape/data/body.npz
 
-# The benchmarks of the fit and of the measurements render bodies that the model never saw, which
-# takes the training extra.
-bench-fit bench-measure: $(VENV)/train.stamp
-bench-capture bench-preprocess bench-calibration: $(VENV)/dev.stamp
+# The benchmark of the fit renders bodies that the model never saw, which takes the training extra.
+bench-fit: $(VENV)/train.stamp
+bench-capture bench-preprocess: $(VENV)/dev.stamp
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

@@ -16,6 +16,9 @@ _BUCKET_S = 0.5
 _MAX_DRIFT = 1e-3
 _LEAST_SPAN_S = 8.0
 _JUMP_S = 1.0
+_STALE_S = 0.1
+"""Frames this late, one after the other, say that the line no longer holds: a replay that plays
+slower than it was recorded, say. It is learned anew; after a mere stall it comes back at once."""
 
 
 @dataclass(slots=True)
@@ -38,8 +41,14 @@ class DeviceClock:
         model starts anew.
         """
         device_s = self._unwrapped_s(ticks, arrival_s)
-        self._learn(device_s, arrival_s - device_s)
-        return device_s + min(self._offset_at(device_s), arrival_s - device_s)
+        delay_s = arrival_s - device_s
+        self._learn(device_s, delay_s)
+        offset_s = self._offset_at(device_s)
+        if delay_s - offset_s > _STALE_S:
+            self._envelope.clear()
+            self._learn(device_s, delay_s)
+            offset_s = delay_s
+        return device_s + min(offset_s, delay_s)
 
     def _unwrapped_s(self, ticks: int, arrival_s: float) -> float:
         span = 1 << self.tick_bits

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from station.bundle import read_bundle
-from station.depth import PointCloud, Preprocessed, preprocess
+from station.depth import PointCloud, Preprocessed, Volume, preprocess
 from workers.export.result import write_result
 from workers.measure.body import measure_body
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
@@ -67,6 +67,7 @@ def reconstruct_bundle(
     *,
     method: Method = "joint",
     model: BodyModel | None = None,
+    volume: Volume | None = None,
     progress: Progress = lambda step, share: None,  # noqa: ARG005
 ) -> JobSummary:
     """Reconstruct a scan bundle into a folder that exists and is empty.
@@ -81,7 +82,7 @@ def reconstruct_bundle(
         model = model or load_model()
     progress("filtering", 0.0)
     with watch.step("preprocess"):
-        scan = preprocess(bundle)
+        scan = preprocess(bundle, volume)
     fit = fit_body(model, scan, method=method, progress=progress)
     return _finish(model, fit, scan.cloud, bundle.scan_id, method, out_folder, watch, progress)
 

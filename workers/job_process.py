@@ -1,6 +1,6 @@
 """A process that warms up, does one job and ends: what it holds or leaks ends with it.
 
-Speaks JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method"}, reports
+Speaks JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method", "volume"}, reports
 {"step", "share"} and ends with {"status", "reasons"} or {"error"}.
 """
 
@@ -25,6 +25,7 @@ def main() -> None:
     # Libraries print to stdout; the pipe to the pool must hear this process alone.
     channel = os.dup(1)
     os.dup2(2, 1)
+    from station.depth import Volume
     from workers.job import reconstruct_bundle, warm_up
 
     model = warm_up()
@@ -38,6 +39,7 @@ def main() -> None:
             Path(order["bundle"]),
             Path(order["out"]),
             method=order["method"],
+            volume=Volume(**order["volume"]),
             model=model,
             progress=lambda step, share: _say(channel, {"step": step, "share": share}),
         )

@@ -48,11 +48,17 @@ class JobProcess:
             stdout=subprocess.PIPE,
         )
 
-    def run(self, bundle: Path, out: Path, method: str, timeout_s: float) -> Outcome:
+    def run(self, bundle: Path, out: Path, config: BoothConfig) -> Outcome:
         """Give it the job and wait for its end; it is killed when it takes too long."""
         process = self._process
         assert process.stdin is not None
-        order = {"bundle": str(bundle), "out": str(out), "method": method}
+        order = {
+            "bundle": str(bundle),
+            "out": str(out),
+            "method": config.workers.method,
+            "volume": config.volume.model_dump(),
+        }
+        timeout_s = config.workers.timeout_s
         try:
             process.stdin.write((json.dumps(order) + "\n").encode())
             process.stdin.close()
@@ -133,7 +139,7 @@ def _do(
     config: BoothConfig, spool: Spool, claim: Claim, process: JobProcess, log: logging.Logger
 ) -> None:
     out = private_folder(spool.temporary(claim.scan_id))
-    outcome = process.run(claim.bundle, out, config.workers.method, config.workers.timeout_s)
+    outcome = process.run(claim.bundle, out, config)
     if outcome.delivered:
         claim.deliver(out)
         log.info("scan %s delivered", claim.scan_id)

@@ -32,7 +32,8 @@ def evaluate(model: BodyModel, count: int, seed: int) -> Iterator[str]:
     for components in _COMPONENTS:
         if components > model.beta_count:
             continue
-        errors = np.stack([_error(_cut(model, components), body) for body in neutral])
+        cut = replace(model, directions=model.directions[:components])
+        errors = np.stack([_error(cut, body) for body in neutral])
         yield f" {components:10d}  {_row(errors)}"
     yield ""
     yield "held-out bodies in held-out poses (mm)"
@@ -53,10 +54,6 @@ def evaluate(model: BodyModel, count: int, seed: int) -> Iterator[str]:
     yield ""
     yield from _specificity(model, neutral, seed)
     yield from _speed(model)
-
-
-def _cut(model: BodyModel, components: int) -> BodyModel:
-    return replace(model, directions=model.directions[:components])
 
 
 def _error(model: BodyModel, body: Array) -> Array:

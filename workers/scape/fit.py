@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
@@ -16,12 +16,18 @@ from station.depth import PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
-from workers.scape.initial import initial_state
-from workers.scape.joint import Sampling, Target, fit_jointly
+from workers.scape.initial import starting_states
+from workers.scape.joint import COARSE, FINE, JointResult, Sampling, Target, fit_jointly
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.paper import fit_like_the_paper
 from workers.scape.surface import SurfaceFit, fit_surface
-from workers.scape.verdict import PartReport, Verdict, judge, report_parts
+from workers.scape.verdict import (
+    PartReport,
+    Verdict,
+    judge,
+    report_parts,
+    unexplained_share,
+)
 
 Array = NDArray[np.float64]
 Method = Literal["joint", "paper"]
@@ -31,6 +37,8 @@ _LEAST_POINTS = 1500
 _PULLED_POINTS = 5000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
+_MOST_STARTS = 4
+_EXPLAINED = 0.008
 _CAMERA_POINTS = 400
 
 
@@ -87,18 +95,16 @@ def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progres
     scout, _ = sampling.stage(_SCOUT_SAMPLES)
     pulled = _even_subset(len(cloud), _PULLED_POINTS)
     target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
-    state = initial_state(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    starts = starting_states(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
     aligned = time.monotonic()
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
-            model, target, state, lambda share: progress("icp", share)
+            model, target, starts[0], lambda share: progress("icp", share)
         )
         used = int(np.isfinite(surface.residual_m).sum())
         fitted = finished = time.monotonic()
     else:
-        joint = fit_jointly(
-            model, sampling, target, state, progress=lambda share: progress("icp", share)
-        )
+        joint = _best_start(model, sampling, target, starts, progress)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
         fitted = time.monotonic()
         progress("surface", 0.0)
@@ -127,6 +133,28 @@ def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progres
             "optimise": finished - fitted,
             "judge": time.monotonic() - finished,
         },
+    )
+
+
+def _best_start(
+    model: BodyModel,
+    sampling: Sampling,
+    target: Target,
+    starts: Sequence[BodyState],
+    progress: Progress,
+) -> JointResult:
+    """Fit from the best start; from others too while a limb's worth of points stays unexplained."""
+    best, least = None, np.inf
+    for start in starts[:_MOST_STARTS]:
+        coarse = fit_jointly(model, sampling, target, start, COARSE)
+        left = unexplained_share(model, coarse.vertices, target.tree)
+        if left < least:
+            best, least = coarse, left
+        if least < _EXPLAINED:
+            break
+    assert best is not None
+    return fit_jointly(
+        model, sampling, target, best.state, FINE, lambda share: progress("icp", share)
     )
 
 

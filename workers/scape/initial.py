@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from station.geometry import so3_exp
 from workers.scape.model import BodyModel, BodyState, SampledBody
 
 Array = NDArray[np.float64]
@@ -48,33 +47,35 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
     return beta * min(1.0, 3.5 / max(norm, 1e-9))
 
 
-def initial_state(model: BodyModel, coarse: SampledBody, points: Array) -> BodyState:
-    """The best of a few arm angles and headings on a coarse sample of the cloud (n, 3)."""
+def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list[BodyState]:
+    """States to start from, best first, judged on a coarse sample of the cloud (n, 3).
+
+    First both arms at one angle and all headings, then each arm alone at the best heading.
+    """
     stature = float(np.quantile(points[:, 2], 0.9995))
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
     trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
     center = np.median(trunk if len(trunk) > 50 else points, axis=0)
     tree = cKDTree(points)
-    best, best_cost = state, np.inf
-    for left, heading in product(_ARMS_DEG, _HEADINGS_DEG):
-        turned = posed(model, state, (left, left), np.radians(heading))
-        candidate = _placed(model, coarse, turned, center)
-        cost = _cost(coarse.evaluate(candidate), points, tree)
-        if cost < best_cost:
-            best, best_cost = candidate, cost
-    heading_rad = float(model.relative_twists(best.rotations)[0, 2])
-    for left, right in product(_ARMS_DEG, _ARMS_DEG):
-        candidate = _placed(model, coarse, posed(model, state, (left, right), heading_rad), center)
-        cost = _cost(coarse.evaluate(candidate), points, tree)
-        if cost < best_cost:
-            best, best_cost = candidate, cost
-    return best
+
+    def tried(arms: tuple[float, float], heading_deg: float) -> tuple[float, BodyState]:
+        turned = posed(model, state, arms, np.radians(heading_deg))
+        candidate = _placed(model, scout, turned, center)
+        return _cost(scout.evaluate(candidate), points, tree), candidate
+
+    _, heading = min(
+        (tried((arm, arm), heading)[0], heading)
+        for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)
+    )
+    scored = [tried(arms, heading) for arms in product(_ARMS_DEG, _ARMS_DEG)]
+    scored.sort(key=lambda entry: entry[0])
+    return [candidate for _, candidate in scored]
 
 
-def _placed(model: BodyModel, coarse: SampledBody, state: BodyState, center: Array) -> BodyState:
+def _placed(model: BodyModel, scout: SampledBody, state: BodyState, center: Array) -> BodyState:
     """Over the cloud's center, soles on the floor."""
-    found = coarse.evaluate(state)
-    trunk = np.isin(model.part_of_vertex[coarse.indices], (0, 1, 2))
+    found = scout.evaluate(state)
+    trunk = np.isin(model.part_of_vertex[scout.indices], (0, 1, 2))
     shift = center - np.median(found[trunk], axis=0)
     shift[2] = -found[:, 2].min()
     return replace(state, translation=state.translation + shift)
@@ -85,13 +86,3 @@ def _cost(body: Array, points: Array, tree: cKDTree) -> float:
     to_cloud, _ = tree.query(body, distance_upper_bound=_TRIM_M)
     to_body, _ = cKDTree(body).query(points, distance_upper_bound=2 * _TRIM_M)
     return float(np.minimum(to_cloud, _TRIM_M).mean() + np.minimum(to_body, 2 * _TRIM_M).mean())
-
-
-def turned_about_vertical(state: BodyState, radians: float, pivot: Array) -> BodyState:
-    """A state turned about a vertical axis through a point."""
-    rotation = so3_exp([0.0, 0.0, radians])
-    return replace(
-        state,
-        rotations=rotation @ state.rotations,
-        translation=rotation @ (state.translation - pivot) + pivot,
-    )

@@ -43,12 +43,14 @@ class Stage:
     """Of the robust weight: residuals beyond it lose their pull."""
 
 
-SCHEDULE = (
+COARSE = (
     *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060) for _ in range(4)),
     *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030) for _ in range(4)),
     *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018) for _ in range(3)),
+)
+FINE = (
     *(Stage(_FINE, 130, 0.05, np.radians(45), 0.010) for _ in range(3)),
-    *(Stage(_FINE, 130, 0.03, np.radians(40), 0.006) for _ in range(3)),
+    *(Stage(_FINE, 130, 0.03, np.radians(40), 0.006) for _ in range(2)),
 )
 
 
@@ -118,7 +120,7 @@ def fit_jointly(
     sampling: Sampling,
     target: Target,
     state: BodyState,
-    schedule: tuple[Stage, ...] = SCHEDULE,
+    schedule: tuple[Stage, ...],
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""

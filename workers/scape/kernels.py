@@ -6,6 +6,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+# The layer that every wheel of numba brings; a process runs one job, so one caller is enough.
+numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]  # set at run time
+
 
 @numba.njit(cache=True, parallel=True, fastmath=True)
 def value_and_derivative(  # type: ignore[no-untyped-def]  # pragma: no cover

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _SEEN_ENOUGH = 0.22
 _EXTREMITY_SEEN_ENOUGH = 0.10
 _PART_RESIDUAL_M = 0.012
-_UNEXPLAINED_SHARE = 0.06
+_UNEXPLAINED_SHARE = 0.015
 _UNEXPLAINED_M = 0.03
 _CAMERA_SHIFT_M = 0.005
 _STATURE_M = (1.30, 2.25)
@@ -52,8 +52,7 @@ def report_parts(
     """Reports by part, the point-to-surface rms in metres and the share of unexplained points."""
     areas = vertex_areas(vertices, model.faces)
     normals = vertex_normals(vertices, model.faces)
-    every = slice(None, None, max(1, len(cloud.points) // 20_000))
-    points, directions = cloud.points[every], cloud.normals[every]
+    points, directions = _thinned(cloud, 20_000)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     offsets = points - vertices[vertex]
     away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
@@ -70,6 +69,20 @@ def report_parts(
         reports.append(PartReport(name, coverage, rms))
     rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
     return tuple(reports), rms, float(unexplained.mean())
+
+
+def unexplained_share(model: BodyModel, vertices: Array, cloud: OrientedTree) -> float:
+    """Share of the points farther than 3 cm from the body's surface: a lost limb, a second body."""
+    points, directions = _thinned(cloud, 5000)
+    normals = vertex_normals(vertices, model.faces)
+    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
+    away = np.linalg.norm(points - vertices[vertex], axis=1)
+    return float(np.mean(away > _UNEXPLAINED_M))
+
+
+def _thinned(cloud: OrientedTree, count: int) -> tuple[Array, Array]:
+    every = slice(None, None, max(1, len(cloud.points) // count))
+    return cloud.points[every], cloud.normals[every]
 
 
 def _groups(model: BodyModel) -> dict[str, list[int]]:
@@ -94,8 +107,8 @@ def judge(
     reasons = [finding.message for finding in findings]
     if unexplained > _UNEXPLAINED_SHARE:
         reasons.append(
-            f"{100 * unexplained:.0f} % of what the cameras saw does not belong to a body; "
-            "clear the booth, or ask for tight clothes"
+            f"{100 * unexplained:.1f} % of what the cameras saw is not met by the body: a limb was "
+            "lost, or something else is in the booth"
         )
     if not _STATURE_M[0] < stature_m < _STATURE_M[1]:
         reasons.append(f"the body is {stature_m:.2f} m tall; only adults can be measured")

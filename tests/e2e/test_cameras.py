@@ -1,0 +1,119 @@
+"""What the operator hears when a camera is not as it should be."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from station.config import CameraConfig
+from station.drivers.freenect import LIBRARY_VARIABLE, FreenectDriver, find_library
+from station.drivers.registry import make_driver
+from station.errors import DriverError
+
+STATION = (sys.executable, "-m", "station.cli")
+
+
+def _recorded(text: str) -> str:
+    return text.replace('"freenect"', '"recorded"')
+
+
+def test_a_camera_that_goes_silent_is_named_within_a_second(
+    make_station: Callable[..., object],
+) -> None:
+    station = make_station("[workers]\ncount = 0", _recorded)
+    assert station.command("start").returncode == 0
+    victim = station.pids("capture", "back-lower")[0]
+    os.kill(victim, signal.SIGSTOP)
+    time.sleep(1.6)
+    status = json.loads(station.command("status", "--json").stdout)
+    refused = station.command("scan")
+    os.kill(victim, signal.SIGCONT)
+    assert status["sync"]["silent"] == ["back-lower"]
+    assert refused.returncode == 1
+    assert "back-lower" in refused.stderr
+
+
+def test_a_camera_that_dies_in_a_scan_fails_it_by_name(make_station: Callable[..., object]) -> None:
+    station = make_station(
+        "[scan]\nframesets = 80\nmax_duration_s = 3.0\n[workers]\ncount = 0", _recorded
+    )
+    assert station.command("start").returncode == 0
+    victim = station.pids("capture", "front-lower")[0]
+    timer = threading.Timer(1.0, lambda: os.kill(victim, signal.SIGSTOP))
+    timer.start()
+    done = station.command("scan")
+    timer.join()
+    os.kill(victim, signal.SIGCONT)
+    assert done.returncode == 1
+    assert "failed" in done.stderr
+    assert "front-lower" in done.stderr
+    assert not list((station.config.parent / "spool/queue").iterdir())
+
+
+def test_a_camera_absent_from_the_calibration_is_named(
+    make_station: Callable[..., object], booth: Path, tmp_path: Path
+) -> None:
+    document = json.loads((booth / "calibration.json").read_text())
+    del document["cameras"]["back-upper"]
+    (tmp_path / "partial.json").write_text(json.dumps(document))
+    station = make_station("[workers]\ncount = 0", _recorded)
+    text = station.config.read_text()
+    station.close()
+    station.config.write_text(
+        text.replace(f"{booth}/calibration.json", str(tmp_path / "partial.json"))
+    )
+    again = type(station)(station.config)
+    try:
+        assert again.command("start").returncode == 0
+        refused = again.command("scan")
+    finally:
+        again.close()
+    assert refused.returncode == 1
+    assert "camera back-upper is not in" in refused.stderr
+
+
+def test_no_sensor_of_that_serial_is_said_with_a_remedy() -> None:
+    """Through the real libfreenect: no Kinect is plugged into a test machine."""
+    try:
+        find_library(replay=False)
+    except DriverError:
+        pytest.skip("libfreenect is not installed")
+    driver = FreenectDriver("A00000000000000A")
+    with pytest.raises(DriverError, match="Kinect A00000000000000A"):
+        driver.open()
+    driver.close()
+
+
+def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch, booth: Path) -> None:
+    monkeypatch.setenv(LIBRARY_VARIABLE, "/nowhere/libfreenect.so.0.5")
+    camera = CameraConfig(name="a", driver="freenect", recording=booth / "front-lower")
+    with pytest.raises(DriverError, match=r"apt-get install libfreenect0\.5"):
+        make_driver(camera).open()
+
+
+def test_commands_without_a_station_end_with_the_remedy(booth: Path, tmp_path: Path) -> None:
+    config = tmp_path / "booth.toml"
+    config.write_text((booth / "booth.toml").read_text() + "[runtime]\ncommand_timeout_s = 0.5\n")
+    done = subprocess.run(
+        [*STATION, "status", "--config", str(config)],
+        capture_output=True, text=True, timeout=20, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "station run" in done.stderr
+
+
+def test_one_station_to_a_runtime_folder(make_station: Callable[..., object]) -> None:
+    station = make_station("[workers]\ncount = 0", _recorded)
+    second = subprocess.run(
+        [*STATION, "run", "--config", str(station.config)],
+        capture_output=True, text=True, timeout=20, check=False,
+    )  # fmt: skip
+    assert second.returncode == 1
+    assert "a station runs already" in second.stderr
