@@ -14,7 +14,7 @@ from workers.scape.model import BodyModel, BodyState, SampledBody
 Array = NDArray[np.float64]
 
 _NEUTRAL_ARM_DEG = 43.0
-_ARMS_DEG = (12.0, 30.0, 48.0, 70.0)
+_ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
 _TRIM_M = 0.08
