@@ -11,10 +11,11 @@ from collections import deque
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-_WINDOW_S = 60.0
+_WINDOW_S = 30.0
 _BUCKET_S = 0.5
-_MAX_DRIFT = 1e-3
-_LEAST_SPAN_S = 8.0
+_MAX_DRIFT = 0.05
+"""Crystals differ by far less; a replay may play a few per cent slower than its ticks say."""
+_LEAST_SPAN_S = 2.0
 _JUMP_S = 1.0
 _STALE_S = 0.1
 """Frames this late, one after the other, say that the line no longer holds: a replay that plays

@@ -13,8 +13,10 @@ import queue
 import threading
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from station.drivers.base import DepthFrame, DeviceInfo
 from station.drivers.raw11 import TABLE
@@ -53,6 +55,15 @@ class _FrameMode(ctypes.Structure):
     )
 
 
+class _Arrival(NamedTuple):
+    """A frame as the library handed it over."""
+
+    raw: NDArray[np.uint16]
+    ticks: int
+    received_s: float
+    sequence: int
+
+
 class _Timeval(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("microseconds", ctypes.c_long))
 
@@ -84,7 +95,7 @@ class FreenectDriver:
         self._name = f"recording {recording}" if recording else f"Kinect {serial}"
         self._library: ctypes.CDLL | None = None
         self._context, self._device = ctypes.c_void_p(), ctypes.c_void_p()
-        self._frames: queue.Queue[DepthFrame] = queue.Queue(_WAITING_FRAMES)
+        self._frames: queue.Queue[_Arrival] = queue.Queue(_WAITING_FRAMES)
         self._stop = threading.Event()
         self._pump: threading.Thread | None = None
         self._failure = ""
@@ -147,13 +158,12 @@ class FreenectDriver:
     def _on_depth(self, device: int, data: int, ticks: int) -> None:
         del device
         received_s = time.monotonic()
-        raw = np.ctypeslib.as_array((ctypes.c_uint16 * (640 * 480)).from_address(data))
-        frame = DepthFrame(
-            TABLE[raw.reshape(480, 640) & 2047], int(ticks), received_s, self._sequence
-        )
+        # A copy and no more: the library's clock waits for this call.
+        raw = np.frombuffer(ctypes.string_at(data, 2 * 640 * 480), np.uint16)
+        arrived = _Arrival(raw, int(ticks), received_s, self._sequence)
         self._sequence += 1
         try:
-            self._frames.put_nowait(frame)
+            self._frames.put_nowait(arrived)
         except queue.Full:
             # The reader is late: the gap in the sequence tells of the loss.
             return
@@ -176,7 +186,7 @@ class FreenectDriver:
 
     def read(self, timeout_s: float) -> DepthFrame | None:
         try:
-            frame = self._frames.get(timeout=timeout_s)
+            arrived = self._frames.get(timeout=timeout_s)
         except queue.Empty:
             if self._failure and self._recording is not None and self._sequence:
                 self._play_again()
@@ -186,8 +196,9 @@ class FreenectDriver:
             if time.monotonic() - self._last_s > _SILENT_S:
                 raise DriverError(f"{self._name} sends no frames; it is opened again") from None
             return None
-        self._last_s = frame.host_time_s
-        return frame
+        self._last_s = arrived.received_s
+        depth = TABLE[arrived.raw.reshape(480, 640) & 2047]
+        return DepthFrame(depth, arrived.ticks, arrived.received_s, arrived.sequence)
 
     def _play_again(self) -> None:
         """A recording at its end starts over, as a sensor whose clock was reset."""

@@ -46,7 +46,10 @@ def _sided(side: str) -> tuple[Definition, ...]:
             f"upper_arm_girth_{side}", "midway from shoulder to elbow", "girth", arm, upper,
             arm, 0.5, iso + "5.3.16",
         ),
-        Definition(f"elbow_girth_{side}", "at the elbow", "girth", fore, upper, fore, 0.0),
+        Definition(
+            f"elbow_girth_{side}", "at the elbow, square to the line shoulder to wrist", "girth",
+            (f"elbow_{side}",), upper, (f"acromion_{side}", f"wrist_{side}"),
+        ),
         Definition(
             f"wrist_girth_{side}", "at the wrist's bone", "girth", fore,
             (f"forearm_{side}", f"hand_{side}"), fore, 1.0, iso + "5.3.19",
@@ -68,7 +71,8 @@ def _sided(side: str) -> tuple[Definition, ...]:
             shin, None, 0.0, iso + "5.3.24",
         ),
         Definition(
-            f"ankle_girth_{side}", "at the ankle's bone", "girth", (f"ankle_{side}",), shin
+            f"ankle_girth_{side}", "just above the ankle's bone", "girth",
+            (f"ankle_{side}", f"knee_{side}"), shin, None, 0.09,
         ),
         Definition(
             f"arm_length_{side}", "shoulder point over elbow to wrist, straight between them",

@@ -34,6 +34,8 @@ _FADE = 2e-4
 _INDEPENDENT = 0.25
 """Share of a vertex' readings that count as independent: matching windows overlap."""
 _LEAST_SIGMA_M = 3e-4
+_SOLE_M = 0.03
+_LIFTED_M = 0.02
 _MOST_POINTS = 90_000
 """More add nothing beyond what neighbouring readings share."""
 
@@ -72,6 +74,7 @@ def fit_surface(
         )
         step *= _hold(model, current, normals, step)
         current = current + step[:, None] * normals
+    current = _stood_on_floor(model, current)
     normals = vertex_normals(current, model.faces)
     residual, weight = _gathered(current, normals, points, directions, noise, *_ROUNDS[-1][:2])
     # A vertex between others that have points is seen as well: the template is finer than pixels.
@@ -107,6 +110,23 @@ def _gathered(
     weight: Array = np.bincount(vertex, information, count).astype(np.float64)
     total: Array = np.bincount(vertex, information * distance, count).astype(np.float64)
     return total / np.maximum(weight, 1e-12), weight
+
+
+def _stood_on_floor(model: BodyModel, vertices: Array) -> Array:
+    """Both feet on z = 0, which calibration knows and no camera sees the soles of.
+
+    The lowest centimetres of each foot are stretched or squeezed; a foot that is clearly lifted
+    stays where it is.
+    """
+    standing = vertices.copy()
+    for side in ("left", "right"):
+        foot = model.part_of_vertex == model.part_names.index(f"foot_{side}")
+        low = float(vertices[foot, 2].min())
+        if abs(low) > _LIFTED_M:
+            continue
+        near = foot & (vertices[:, 2] < _SOLE_M)
+        standing[near, 2] = (vertices[near, 2] - low) * _SOLE_M / (_SOLE_M - low)
+    return standing
 
 
 def _hold(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
