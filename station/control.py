@@ -18,6 +18,7 @@ from station.config import BoothConfig, find_config, load_config
 from station.errors import BoothError
 from station.files import private_folder, write_json
 from station.messages import DesiredState, Reply, Request, ScanEvent
+from station.retention import expire_old
 from station.service import notify, set_up_logs, stop_event
 from station.session import ON_DISK, Session, advance, expire
 from station.spool import REASON, Spool
@@ -29,6 +30,7 @@ _SYNC_TIMEOUT_S = 2.0
 _GRACE_S = 4.0
 """Beyond a scan's longest duration: writing the bundle and the news of it."""
 _SESSIONS_KEPT = 200
+_TIDY_PERIOD_S = 3600.0
 
 
 class ControlProcess:
@@ -46,6 +48,7 @@ class ControlProcess:
         self._memory = private_folder(self._folder) / "desired.json"
         self._streaming = self._remembered()
         self._wished_s = 0.0
+        self._tidied_s = -_TIDY_PERIOD_S
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
@@ -61,8 +64,13 @@ class ControlProcess:
                 self._hear(event)
             if self._requests in ready:
                 self._answer()
-            if time.monotonic() - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
+            now_s = time.monotonic()
+            if now_s - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
                 self._wish()
+            if now_s - self._tidied_s > _TIDY_PERIOD_S:
+                self._tidied_s = now_s
+                for folder in expire_old(self._spool, self._config.retention, time.time()):
+                    self._log.info("removed %s: its retention period is over", folder)
         self._context.destroy(linger=0)
 
     def _remembered(self) -> bool:

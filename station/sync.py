@@ -47,6 +47,8 @@ class Collection:
     label: str
     deadline_s: float
     sets: list[Frameset[LiveFrame]] = field(default_factory=list)
+    complete_s: float = 0.0
+    """When its last frameset came."""
 
 
 class SyncProcess:
@@ -117,6 +119,7 @@ class SyncProcess:
             self._collection.sets.append(found)
             self._tell(self._collection, "capturing")
             if len(self._collection.sets) >= self._config.scan.framesets:
+                self._collection.complete_s = now_s
                 self._write(self._collection)
                 self._collection = None
         if now_s - self._live_s > 1.0 / self._config.sync.live_hz:
@@ -207,10 +210,9 @@ class SyncProcess:
     def _write(self, collection: Collection) -> None:
         rig = self._rig
         assert rig is not None
-        self._writing[collection.scan_id] = self._writer.submit(self._write_bundle, collection, rig)
-        self._writing[collection.scan_id].add_done_callback(
-            lambda done: self._written(collection, done)
-        )
+        writing = self._writer.submit(self._write_bundle, collection, rig)
+        self._writing[collection.scan_id] = writing
+        writing.add_done_callback(lambda done: self._written(collection, done))
 
     def _write_bundle(self, collection: Collection, rig: Rig) -> None:
         spool = Spool(self._config.spool.folder)
@@ -244,6 +246,11 @@ class SyncProcess:
     def _written(self, collection: Collection, done: Future[None]) -> None:
         error = done.exception()
         if error is None:
+            self._log.info(
+                "scan %s written %.2f s after its last frameset",
+                collection.scan_id,
+                time.monotonic() - collection.complete_s,
+            )
             self._end(collection, "accepted", "")
         else:
             self._end(collection, "failed", f"the scan could not be written ({error}); scan again")
@@ -253,6 +260,7 @@ class SyncProcess:
         self._ended[collection.scan_id] = event
         for old in list(self._ended)[:-100]:
             del self._ended[old]
+        self._writing.pop(collection.scan_id, None)
         self._log.info("scan %s %s %s", collection.scan_id, state, reason)
 
     def _tell(self, collection: Collection, state: str, reason: str = "") -> ScanEvent:
