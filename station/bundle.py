@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,6 +22,7 @@ VERSIONS = frozenset({1})
 MANIFEST = "bundle.json"
 CALIBRATION = "calibration.json"
 _PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+_ENCODERS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,8 +202,9 @@ def write_bundle(
 
 def _write_frames(folder: Path, camera: str, taken: Sequence[CapturedFrame]) -> dict[str, Any]:
     private_folder(folder / "depth" / camera)
-    entries = []
-    for index, frame in enumerate(taken):
+
+    def write(index: int) -> dict[str, Any]:
+        frame = taken[index]
         file = f"depth/{camera}/{index:03d}.png"
         done, encoded = cv2.imencode(".png", frame.depth, _PNG_FAST)
         if not done:
@@ -210,5 +213,8 @@ def _write_frames(folder: Path, camera: str, taken: Sequence[CapturedFrame]) -> 
         record = FrameRecord(
             file, frame.device_ticks, frame.tick_hz, frame.host_time_s, frame.sequence
         )
-        entries.append(asdict(record))
-    return {"frames": entries}
+        return asdict(record)
+
+    # Encoding leaves the interpreter free: the person waits for it.
+    with ThreadPoolExecutor(max_workers=_ENCODERS) as pool:
+        return {"frames": list(pool.map(write, range(len(taken))))}

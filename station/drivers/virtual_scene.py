@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,7 +49,7 @@ def load_mesh(path: Path) -> Mesh:
         else:
             mesh = o3d.io.read_triangle_mesh(str(path))
             vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int32)
-    except (OSError, KeyError, ValueError) as cause:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as cause:
         raise InputError(
             f"{path} cannot be read as a mesh ({cause}); give .npz, .ply or .obj"
         ) from None

@@ -1,0 +1,84 @@
+"""Averaging, cleaning and merging a bundle's frames."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.bundle import read_bundle
+from station.depth import Volume, preprocess
+from station.depth.average import average
+from station.depth.points import normals, project, rays
+from station.drivers.virtual import SimulatedBooth, render_bundle
+from station.drivers.virtual_scene import Mesh, default_rig, load_mesh
+from station.errors import InputError
+
+BODIES = Path(__file__).parents[2] / "station/data/bodies"
+
+
+def test_the_mean_leaves_out_what_flies() -> None:
+    stack = np.full((10, 2, 2), 15_000, np.uint16)
+    stack[3] = 22_000
+    stack[4] = 0
+    averaged = average(stack, 1e-4)
+    assert np.allclose(averaged.depth_m, 1.5)
+    assert (averaged.count == 8).all()
+
+
+def test_a_flickering_pixel_is_no_reading() -> None:
+    stack = np.zeros((10, 1, 2), np.uint16)
+    stack[:3, 0, 0] = 15_000
+    stack[:5, 0, 1] = 15_000
+    averaged = average(stack, 1e-4)
+    assert averaged.depth_m[0, 0] == 0.0
+    assert averaged.depth_m[0, 1] > 0.0
+
+
+def test_projection_inverts_the_rays() -> None:
+    camera = default_rig().cameras["front-upper"]
+    points = 1.7 * rays(camera)[100:110, 200:210].reshape(-1, 3).astype(np.float64)
+    v, u = np.meshgrid(np.arange(100, 110), np.arange(200, 210), indexing="ij")
+    assert np.allclose(project(camera, points), np.stack([u.ravel(), v.ravel()], 1), atol=1e-3)
+
+
+def test_normals_face_the_camera() -> None:
+    camera = default_rig().cameras["front-upper"]
+    depth = np.full((camera.height, camera.width), 1.5, np.float32)
+    directions, valid = normals(rays(camera) * depth[..., None], depth)
+    assert valid[2:-2, 2:-2].all()
+    assert np.allclose(directions[240, 320], (0, 0, -1), atol=1e-3)
+
+
+def test_a_person_who_moved_is_reported_in_millimetres(tmp_path: Path) -> None:
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0)
+    first = render_bundle(body, tmp_path / "first", booth)
+    later = Mesh(body.vertices + np.array([0.0, 0.03, 0.0]), body.faces)
+    second = render_bundle(later, tmp_path / "second", booth)
+    for index in range(6, 10):
+        for camera in booth.rig.cameras:
+            name = f"depth/{camera}/{index:03d}.png"
+            shutil.copy(second / name, first / name)
+    found = preprocess(read_bundle(first)).findings
+    moved = [finding for finding in found if finding.code == "motion"]
+    assert moved
+    assert moved[0].value == pytest.approx(0.03, abs=0.015)
+    assert "the person moved" in moved[0].message
+
+
+def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:
+    with pytest.raises(InputError, match="the booth is empty"):
+        preprocess(read_bundle(bundle), Volume((1.2, -0.5, 0.5), (1.8, 0.5, 2.0)))
+
+
+def test_the_cloud_is_one_person_without_floor_and_walls(bundle: Path) -> None:
+    scan = preprocess(read_bundle(bundle))
+    assert scan.findings == ()
+    assert scan.cloud.points[:, 2].min() > 0.01
+    assert np.abs(scan.cloud.points[:, :2]).max() < 1.0
+    assert np.allclose(np.linalg.norm(scan.cloud.normals, axis=1), 1.0, atol=1e-5)
+    assert len(scan.cloud) > 100_000
+    assert set(scan.cloud.camera) == {0, 1, 2, 3}
+    for view in scan.views:
+        assert not (view.person & view.background).any()

@@ -1,0 +1,110 @@
+"""The virtual Kinect: what it shows, its noise, its clock, and its recordings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.config import CameraConfig
+from station.drivers.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
+from station.drivers.registry import make_driver
+from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
+from station.drivers.virtual_noise import raw_from_depth
+from station.drivers.virtual_scene import default_rig, load_mesh, sphere
+from station.errors import DriverError, FormatError, InputError
+from station.recording import check_recording, read_raw, write_recording
+
+BODIES = Path(__file__).parents[2] / "station/data/bodies"
+
+
+def test_raw_values_and_depths_are_inverse() -> None:
+    raw = np.arange(500, 1000)
+    assert np.array_equal(raw_from_depth(depth_m_of_raw(raw).astype(np.float32)), raw)
+    assert TABLE[2047] == 0
+    assert TABLE[0] > 0
+
+
+def test_an_off_centre_ball_stands_where_it_is() -> None:
+    """A ray caster whose pictures were turned by 180 degrees went unnoticed with a centred body."""
+    center = np.array([0.25, -0.1, 1.7])
+    rig = default_rig()
+    booth = SimulatedBooth(rig=rig, walls=False, clutter=[sphere(center, 0.1)])
+    for name, seen in (("front-upper", True), ("back-upper", True)):
+        frame = next(VirtualCamera(booth, name, None).frames(1))
+        v, u = np.nonzero(TABLE[frame.raw])
+        assert bool(len(v)) is seen
+        camera = rig.cameras[name]
+        local = np.linalg.inv(camera.world_from_camera) @ np.append(center, 1.0)
+        pixel = camera.K @ (local[:3] / local[2])
+        assert np.hypot(np.median(u) - pixel[0], np.median(v) - pixel[1]) < 6.0
+        depth = np.median(TABLE[frame.raw][v, u]) * DEPTH_SCALE_M
+        assert local[2] - 0.1 < depth < local[2]
+
+
+def test_the_same_seed_gives_the_same_frames() -> None:
+    booth = SimulatedBooth(walls=False, clutter=[sphere((0, 0, 1.5), 0.2)])
+    first, again = (
+        [frame.raw for frame in VirtualCamera(booth, "front-upper", None).frames(3)]
+        for _ in range(2)
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first[0], first[1])
+
+
+def test_the_random_error_grows_as_published() -> None:
+    """sigma_z = 1.425e-3 z^2 (Khoshelham & Elberink 2012), here beside quantisation."""
+    booth = SimulatedBooth(walls=False, clutter=[sphere((0, 0, 1.47), 0.3)])
+    frames = VirtualCamera(booth, "front-upper", None).frames(30)
+    stack = np.stack([TABLE[frame.raw] for frame in frames]) * DEPTH_SCALE_M
+    nearest = stack[:, 238:242, 318:322].reshape(30, -1)
+    z = nearest.mean()
+    step = z**2 / (8 * 585 * 0.075)
+    expected = np.hypot(1.425e-3 * z**2, step / np.sqrt(12))
+    assert nearest.std(axis=0).mean() == pytest.approx(expected, rel=0.35)
+
+
+def test_a_live_virtual_sensor_keeps_time() -> None:
+    camera = CameraConfig(name="front-upper", driver="virtual", body=BODIES / "ann.npz", seed=2)
+    driver = make_driver(camera)
+    info = driver.open()
+    frames = [driver.read(1.0) for _ in range(6)]
+    driver.close()
+    taken = [frame for frame in frames if frame is not None]
+    assert len(taken) == 6
+    steps = np.diff([frame.device_ticks for frame in taken]) / info.tick_hz
+    assert np.allclose(steps, 1 / 30, rtol=1e-3)
+    assert [frame.sequence for frame in taken] == list(range(6))
+    assert (taken[0].depth > 0).mean() > 0.2
+
+
+def test_a_camera_that_the_virtual_booth_has_not_is_named() -> None:
+    camera = CameraConfig(name="ceiling", driver="virtual", body=BODIES / "ann.npz")
+    with pytest.raises(DriverError, match="camera ceiling"):
+        make_driver(camera).open()
+
+
+def test_recordings_come_back_with_their_clock(tmp_path: Path) -> None:
+    booth = SimulatedBooth(walls=False, clutter=[sphere((0, 0, 1.5), 0.2)])
+    camera = VirtualCamera(booth, "front-upper", None)
+    count = write_recording(tmp_path / "a", recorded_frames(camera, 3), tick_hz=TICK_HZ, passes=4)
+    frames = check_recording(tmp_path / "a")
+    assert count == len(frames) == 12
+    seconds = [entry[0] for entry in frames]
+    assert np.allclose(np.diff(seconds), 1 / 30, atol=1e-5)
+    ticks = np.array([entry[1] for entry in frames], dtype=np.int64)
+    assert np.allclose(np.diff(ticks) % 2**32 / TICK_HZ, 1 / 30, rtol=1e-3)
+    assert np.array_equal(read_raw(frames[0][2]), read_raw(frames[3][2]))
+    frames[5][2].unlink()
+    frames[5][2].write_bytes(b"P5 640 480 65535\n")
+    with pytest.raises(FormatError, match="is torn"):
+        check_recording(tmp_path / "a")
+    with pytest.raises(FormatError, match="station record-virtual"):
+        check_recording(tmp_path / "b")
+
+
+@pytest.mark.parametrize("content", [b"", b"no mesh"])
+def test_an_unusable_body_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "body.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"body\.npz"):
+        load_mesh(path)
