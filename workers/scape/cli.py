@@ -12,9 +12,9 @@ import click
     "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
 )
 @click.option("--seed", default=0, show_default=True, help="the same seed learns the same model")
-@click.option("--bodies", default=3000, show_default=True, help="training bodies")
-@click.option("--poses", default=1200, show_default=True, help="training poses")
-@click.option("--components", default=130, show_default=True, help="shape components kept")
+@click.option("--bodies", default=4000, show_default=True, help="training bodies")
+@click.option("--poses", default=1500, show_default=True, help="training poses")
+@click.option("--components", default=160, show_default=True, help="shape components kept")
 def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> None:
     """Build the database and learn the body model (minutes; needs the train extra).
 

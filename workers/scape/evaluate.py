@@ -14,7 +14,7 @@ from workers.scape.model import BodyModel, BodyState
 
 Array = NDArray[np.float64]
 
-_COMPONENTS = (10, 20, 40, 60, 80, 100, 130)
+_COMPONENTS = (10, 20, 40, 60, 80, 100, 130, 160)
 _SAMPLES = 3000
 
 

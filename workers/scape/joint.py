@@ -29,6 +29,8 @@ _TWIST_INFLATION = 1.5
 _FLOOR_SIGMA_M = 0.004
 _SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
+_EVERY = 1 << 20
+"""Components: as many as the model has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +51,8 @@ COARSE = (
     *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018) for _ in range(3)),
 )
 FINE = (
-    *(Stage(_FINE, 130, 0.05, np.radians(45), 0.010) for _ in range(3)),
-    *(Stage(_FINE, 130, 0.03, np.radians(40), 0.006) for _ in range(2)),
+    *(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010) for _ in range(3)),
+    *(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006) for _ in range(2)),
 )
 
 

@@ -23,9 +23,9 @@ Progress = Callable[[str, float], None]
 class TrainingPlan:
     """How much is learned from how many."""
 
-    bodies: int = 3000
-    poses: int = 1200
-    components: int = 130
+    bodies: int = 4000
+    poses: int = 1500
+    components: int = 160
     seed: int = 0
 
 

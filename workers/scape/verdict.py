@@ -20,6 +20,8 @@ _EXTREMITY_SEEN_ENOUGH = 0.10
 _PART_RESIDUAL_M = 0.012
 _UNEXPLAINED_SHARE = 0.015
 _UNEXPLAINED_M = 0.03
+_LOST_POINTS_SHARE = 0.001
+_UNMET_SHARE = 0.15
 _CAMERA_SHIFT_M = 0.005
 _STATURE_M = (1.30, 2.25)
 _IMPLAUSIBLE_BETA = 6.0
@@ -36,6 +38,8 @@ class PartReport:
     """Share of its area that cameras saw."""
     residual_rms_m: float
     """Of the points that belong to it."""
+    unmet: float
+    """Share of the points around it that lie farther than 3 cm from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +70,18 @@ def report_parts(
         own = np.isin(part[vertex], members) & ~unexplained
         rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
         coverage = float(areas[mine & seen].sum() / areas[mine].sum())
-        reports.append(PartReport(name, coverage, rms))
+        around = np.isin(part[vertex], members)
+        reports.append(PartReport(name, coverage, rms, _unmet(around, unexplained)))
     rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
     return tuple(reports), rms, float(unexplained.mean())
+
+
+def _unmet(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
+    """A few stray points are noise; a cluster of them is a limb that the fit lost."""
+    lost = int(np.count_nonzero(around & unexplained))
+    if lost < _LOST_POINTS_SHARE * len(around):
+        return 0.0
+    return lost / int(np.count_nonzero(around))
 
 
 def unexplained_share(model: BodyModel, vertices: Array, cloud: OrientedTree) -> float:
@@ -120,6 +133,8 @@ def judge(
         enough = _EXTREMITY_SEEN_ENOUGH if part.name.startswith(_EXTREMITIES) else _SEEN_ENOUGH
         if part.coverage < enough:
             reasons.append(f"{words} not seen ({100 * part.coverage:.0f} % of it)")
+        elif part.unmet > _UNMET_SHARE:
+            reasons.append(f"{words} not met by the fit ({100 * part.unmet:.0f} % of its points)")
         elif part.residual_rms_m > _PART_RESIDUAL_M:
             reasons.append(f"{words} not met ({1e3 * part.residual_rms_m:.0f} mm off)")
     for camera, shift in camera_shifts_m.items():
