@@ -26,6 +26,7 @@ _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
 _ROW_SHARE = 0.12
 _TWIST_INFLATION = 1.5
+_THUMB_STIFFNESS = 3.0
 _FLOOR_SIGMA_M = 0.004
 _SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
@@ -213,7 +214,13 @@ class _TwistPrior:
     def build(cls, model: BodyModel) -> _TwistPrior:
         covariance = model.twist_covariance * _TWIST_INFLATION**2
         covariance = covariance + np.radians(1.5) ** 2 * np.eye(len(covariance))
-        return cls(model.twist_mean, np.linalg.inv(covariance))
+        # The few points of a thumb must not turn it into the palm.
+        stiff = [
+            _THUMB_STIFFNESS if name.startswith("thumb") else 1.0 for name in model.part_names[1:]
+        ]
+        scale = np.repeat(stiff, 3)
+        information = np.linalg.inv(covariance) * scale[:, None] * scale[None, :]
+        return cls(model.twist_mean, information)
 
 
 def _step(
