@@ -6,10 +6,8 @@ filter the depth images, fit the SCAPE model to them, measure the body.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from station.bundle import read_bundle
@@ -18,6 +16,7 @@ from workers.export.result import write_result
 from workers.measure.body import measure_body
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
 from workers.scape.model import BodyModel, load_model
+from workers.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
 """Called with the step's name and the share of it that is done, 0 to 1."""
@@ -30,25 +29,6 @@ class JobSummary:
     status: str
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
-
-
-@dataclass(slots=True)
-class Stopwatch:
-    """Seconds by step, for result.json."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _start_s: float = field(default_factory=time.monotonic)
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        start_s = time.monotonic()
-        try:
-            yield
-        finally:
-            self.seconds[name] = time.monotonic() - start_s
-
-    def total_s(self) -> float:
-        return time.monotonic() - self._start_s
 
 
 def warm_up() -> BodyModel:

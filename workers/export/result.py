@@ -8,7 +8,7 @@ import platform
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from workers.export.preview import preview
 from workers.measure.body import Measurement
 from workers.scape.fit import FitResult
 from workers.scape.model import BodyModel
-
-if TYPE_CHECKING:
-    from workers.job import Stopwatch
+from workers.stopwatch import Stopwatch
 
 _LIBRARIES = ("numpy", "scipy", "open3d-cpu", "opencv-contrib-python-headless", "cholespy")
 
