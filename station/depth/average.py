@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 _SIGMA_COEFFICIENT = 1.425e-3
 """Random error of a Kinect v1: sigma_z = c z^2 (Khoshelham & Elberink 2012)."""
 _GATE_SIGMAS = 3.0
+_STRAY_READINGS = 2
 _STEP_COEFFICIENT = 1.0 / (8.0 * 585.0 * 0.075)
 """Depth step of 1/8 px of disparity: z^2 / (8 f b)."""
 
@@ -23,6 +24,8 @@ class AveragedDepth:
     """Mean of the readings near their median; 0 where too few agree."""
     count: NDArray[np.uint8]
     """How many readings the mean is of."""
+    unsettled_m: NDArray[np.float32]
+    """Median where two or more readings lie far from it, as on a body that moved; 0 elsewhere."""
     change_m: NDArray[np.float32]
     """Mean of the last third less that of the first; NaN where either has no reading."""
 
@@ -43,12 +46,14 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
     depth = np.zeros(stack.shape[1:], np.float32)
     count = np.zeros(stack.shape[1:], np.uint8)
     change = np.full(stack.shape[1:], np.nan, np.float32)
-    _average(stack, np.float32(scale_m), least, max(1, frames // 3), depth, count, change)
-    return AveragedDepth(depth, count, change)
+    unsettled = np.zeros(stack.shape[1:], np.float32)
+    third = max(1, frames // 3)
+    _average(stack, np.float32(scale_m), least, third, depth, count, unsettled, change)
+    return AveragedDepth(depth, count, unsettled, change)
 
 
 @numba.njit(cache=True, nogil=True)
-def _average(stack, scale, least, third, depth, count, change):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _average(stack, scale, least, third, depth, count, unsettled, change):  # type: ignore[no-untyped-def]  # pragma: no cover
     frames, height, width = stack.shape
     values = np.empty(frames, np.float32)
     order = np.empty(frames, np.float32)
@@ -87,6 +92,8 @@ def _average(stack, scale, least, third, depth, count, change):  # type: ignore[
                     elif i >= frames - third:
                         late += value
                         late_count += 1
+            if valid - kept >= _STRAY_READINGS:
+                unsettled[y, x] = median
             if kept < least:
                 continue
             depth[y, x] = total / kept

@@ -29,6 +29,7 @@ _LEAST_POINTS = 2000
 _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 0.7
 _MOTION_M = 0.010
+_UNSETTLED_SHARE = 0.25
 _SIGMA_FLOOR_M = 4e-4
 """What averaging more frames does not take away: quantisation, calibration."""
 
@@ -103,6 +104,8 @@ class _Camera:
     normals: Array
     sigma_m: Array
     change_m: Array
+    unsettled: float
+    """Share of the readings in the volume that do not agree over the frames."""
     frames: int
 
 
@@ -140,12 +143,16 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     pose = calibration.world_from_camera
     near = _in_volume(camera_points(calibration, depth), depth, pose, volume)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    restless = _in_volume(
+        camera_points(calibration, averaged.unsettled_m), averaged.unsettled_m, pose, volume
+    )
+    unsettled = float(restless.sum() / max(1, (near | restless).sum()))
     if not len(rows):
         nothing = np.empty((0, 3))
         none = np.empty(0)
         return _Camera(
             calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
-            len(bundle.frames[name]),
+            unsettled, len(bundle.frames[name]),
         )  # fmt: skip
     # Everything from here on is done on the person's part of the image alone.
     top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, depth.shape[0])
@@ -180,6 +187,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         normals=directions[valid].astype(np.float64) @ pose[:3, :3].T,
         sigma_m=np.hypot(sigma, _SIGMA_FLOOR_M),
         change_m=averaged.change_m[window][valid].astype(np.float64),
+        unsettled=unsettled,
         frames=len(bundle.frames[name]),
     )
 
@@ -262,6 +270,12 @@ def _camera_findings(name: str, camera: _Camera, keep: Mask, expected: int) -> l
     if moved_m > _MOTION_M:
         message = f"the person moved {1e3 * moved_m:.0f} mm between frames (camera {name})"
         found.append(Finding("motion", name, moved_m, message))
+    elif camera.unsettled > _UNSETTLED_SHARE:
+        message = (
+            f"the person moved between frames: {100 * camera.unsettled:.0f} % of what camera "
+            f"{name} saw does not agree"
+        )
+        found.append(Finding("motion", name, None, message))
     return found
 
 

@@ -132,7 +132,7 @@ def nricp(model: BodyModel, scan: Preprocessed) -> Array:
     source = trimesh.Trimesh(start, model.faces, process=False)
     moved: Array = trimesh.registration.nricp_amberg(
         source, target, distance_threshold=0.1, use_faces=False,
-        steps=[[0.01, 0, 0.0, 0], [0.005, 0, 0.0, 0], [0.001, 0, 0.0, 0]],
+        steps=[[0.02, 0, 0, 5], [0.007, 0, 0, 5], [0.002, 0, 0, 5]],
     )  # fmt: skip
     return moved
 

@@ -67,6 +67,22 @@ def test_a_person_who_moved_is_reported_in_millimetres(tmp_path: Path) -> None:
     assert "the person moved" in moved[0].message
 
 
+def test_a_large_step_is_never_missed(tmp_path: Path) -> None:
+    """Readings that moved by 10 cm were dropped as outliers, and the motion with them."""
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0)
+    first = render_bundle(body, tmp_path / "first", booth)
+    assert preprocess(read_bundle(first)).findings == ()
+    later = Mesh(body.vertices + np.array([0.0, 0.1, 0.0]), body.faces)
+    second = render_bundle(later, tmp_path / "second", booth)
+    for index in (9, 8):
+        for camera in booth.rig.cameras:
+            name = f"depth/{camera}/{index:03d}.png"
+            shutil.copy(second / name, first / name)
+    found = preprocess(read_bundle(first)).findings
+    assert {finding.code for finding in found} == {"motion"}
+
+
 def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:
     with pytest.raises(InputError, match="the booth is empty"):
         preprocess(read_bundle(bundle), Volume((1.2, -0.5, 0.5), (1.8, 0.5, 2.0)))
