@@ -16,6 +16,7 @@ from station.depth import PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
+from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
 from workers.scape.joint import COARSE, FINE, JointResult, Sampling, Target, fit_jointly
 from workers.scape.model import BodyModel, BodyState
@@ -155,9 +156,9 @@ def _best_start(
         if least < _EXPLAINED:
             break
     assert best is not None
-    return fit_jointly(
-        model, sampling, target, best.state, FINE, lambda share: progress("icp", share)
-    )
+    normals = vertex_normals(best.vertices, model.faces)
+    state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
+    return fit_jointly(model, sampling, target, state, FINE, lambda share: progress("icp", share))
 
 
 def _refuse_absurd(cloud: PointCloud) -> None:

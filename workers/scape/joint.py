@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree, compatible
 from workers.scape.deformation import vertex_areas, vertex_normals
+from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
 
 Array = NDArray[np.float64]
@@ -64,6 +65,7 @@ class Sampling:
     body: SampledBody
     coarse_of_vertex: NDArray[np.intp]
     fine_of_vertex: NDArray[np.intp]
+    hands: tuple[Hand, ...]
 
     @classmethod
     def build(cls, model: BodyModel) -> Sampling:
@@ -73,6 +75,7 @@ class Sampling:
             model.at(order),
             cKDTree(model.mean[order[:_COARSE]]).query(model.mean)[1],
             cKDTree(model.mean[order]).query(model.mean)[1],
+            hands_of(model),
         )
 
     def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
