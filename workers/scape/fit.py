@@ -20,6 +20,7 @@ from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
 from workers.scape.joint import COARSE, FINE, JointResult, Sampling, Target, fit_jointly
 from workers.scape.model import BodyModel, BodyState
+from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
 from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
@@ -76,6 +77,7 @@ def fit_body(
     *,
     method: Method = "joint",
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> FitResult:
     """Fit the model to a preprocessed scan.
 
@@ -85,11 +87,14 @@ def fit_body(
     _refuse_absurd(scan.cloud)
     # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _fit(model, scan, method, progress)
+        return _fit(model, scan, method, progress, observer)
 
 
-def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progress) -> FitResult:
+def _fit(
+    model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
+) -> FitResult:
     cloud = scan.cloud
+    observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
@@ -97,30 +102,36 @@ def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progres
     pulled = _even_subset(len(cloud), _PULLED_POINTS)
     target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
     starts = starting_states(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    if observer is not unobserved:
+        observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
-            model, target, starts[0], lambda share: progress("icp", share)
+            model, target, starts[0], lambda share: progress("icp", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
         fitted = finished = time.monotonic()
     else:
-        joint = _best_start(model, sampling, target, starts, progress)
+        joint = _best_start(model, sampling, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
+        observer("joint", {"vertices": joint.vertices})
         fitted = time.monotonic()
         progress("surface", 0.0)
         surface = fit_surface(model, joint.vertices, target.tree, cloud.sigma_m)
         finished = time.monotonic()
+    observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, target.tree)
     shifts = _camera_shifts(model, surface, cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
+    # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
+    # the same scan gives the same file.
+    delivered = np.round(surface.vertices, 7)
+    observer("done", {"vertices": delivered})
     progress("done", 1.0)
     return FitResult(
         state=state,
-        # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does
-        # not: the same scan gives the same file.
-        vertices=np.round(surface.vertices, 7),
+        vertices=delivered,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
@@ -145,11 +156,12 @@ def _best_start(
     target: Target,
     starts: Sequence[BodyState],
     progress: Progress,
+    observer: Observer,
 ) -> JointResult:
     """Fit from the best start; from others too while a limb's worth of points stays unexplained."""
     best, least = None, np.inf
     for start in starts[:_MOST_STARTS]:
-        coarse = fit_jointly(model, sampling, target, start, COARSE)
+        coarse = fit_jointly(model, sampling, target, start, COARSE, observer=observer)
         left = unexplained_share(model, coarse.vertices, target.tree)
         if left < least:
             best, least = coarse, left
@@ -158,7 +170,9 @@ def _best_start(
     assert best is not None
     normals = vertex_normals(best.vertices, model.faces)
     state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
-    return fit_jointly(model, sampling, target, state, FINE, lambda share: progress("icp", share))
+    return fit_jointly(
+        model, sampling, target, state, FINE, lambda share: progress("icp", share), observer
+    )
 
 
 def _refuse_absurd(cloud: PointCloud) -> None:

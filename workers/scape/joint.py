@@ -20,6 +20,7 @@ from workers.scape.correspondence import OrientedTree, compatible
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
+from workers.scape.observer import Observer, unobserved
 
 Array = NDArray[np.float64]
 
@@ -128,6 +129,7 @@ def fit_jointly(
     state: BodyState,
     schedule: tuple[Stage, ...],
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
@@ -137,7 +139,7 @@ def fit_jointly(
         body, sample_of_vertex = sampling.stage(stage.samples)
         vertices = model.vertices(state)
         weight, pull, used = _data_terms(
-            model, target, vertices, stage, sample_of_vertex, len(body.indices)
+            model, target, vertices, stage, sample_of_vertex, len(body.indices), observer
         )
         state, information = _step(model, body, state, stage, weight, pull, prior)
         progress((step + 1) / len(schedule))
@@ -152,6 +154,7 @@ def _data_terms(
     stage: Stage,
     sample_of_vertex: NDArray[np.intp],
     samples: int,
+    observer: Observer,
 ) -> tuple[Array, Array, int]:
     """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3), and the number of rows."""
     normals = vertex_normals(vertices, model.faces)
@@ -174,6 +177,8 @@ def _data_terms(
         max_angle_rad=stage.angle_rad,
     )
     vertex, offsets = vertex[kept], offsets[kept]
+    on_body, on_cloud = vertices[vertex], cloud.points[point[kept]]
+    observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
     direction = normals[vertex]
     residual = np.einsum("ni,ni->n", direction, offsets)
     variance = target.sigma_m[point[kept]] ** 2 + _MODEL_SIGMA_M**2
