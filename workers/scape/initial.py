@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from workers.scape.model import BodyModel, BodyState, SampledBody
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.sampled import SampledBody
 
 Array = NDArray[np.float64]
 

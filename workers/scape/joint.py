@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree, compatible
 from workers.scape.deformation import vertex_areas, vertex_normals
-from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.sampled import SampledBody, twist_chain
 
 Array = NDArray[np.float64]
 
@@ -78,8 +79,7 @@ class Sampling:
     def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
         if count == _FINE:
             return self.body, self.fine_of_vertex
-        body = SampledBody(self.body.model, self.body.indices[:count], self.body.basis[:count])
-        return body, self.coarse_of_vertex
+        return self.body.first(count), self.coarse_of_vertex
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
