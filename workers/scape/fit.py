@@ -18,7 +18,15 @@ from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
-from workers.scape.joint import COARSE, FINE, JointResult, Sampling, Target, fit_jointly
+from workers.scape.joint import (
+    COARSE,
+    FINE,
+    JointResult,
+    Sampling,
+    Target,
+    even_subset,
+    fit_jointly,
+)
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
@@ -36,7 +44,7 @@ Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
-_PULLED_POINTS = 5000
+_TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
@@ -99,9 +107,8 @@ def _fit(
     progress("aligning", 0.0)
     sampling = sampling_of(model)
     scout, _ = sampling.stage(_SCOUT_SAMPLES)
-    pulled = _even_subset(len(cloud), _PULLED_POINTS)
-    target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
-    starts = starting_states(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    target = Target.build(cloud, len(cloud) if method == "paper" else _TREE_POINTS)
+    starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
@@ -112,15 +119,15 @@ def _fit(
         used = int(np.isfinite(surface.residual_m).sum())
         fitted = finished = time.monotonic()
     else:
-        joint = _best_start(model, sampling, target, starts, progress, observer)
+        joint = _best_start(model, sampling, cloud, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
         observer("joint", {"vertices": joint.vertices})
         fitted = time.monotonic()
         progress("surface", 0.0)
-        surface = fit_surface(model, joint.vertices, target.tree, cloud.sigma_m)
+        surface = fit_surface(model, joint.vertices, cloud)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
-    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, target.tree)
+    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
     shifts = _camera_shifts(model, surface, cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
@@ -153,6 +160,7 @@ def _fit(
 def _best_start(
     model: BodyModel,
     sampling: Sampling,
+    cloud: PointCloud,
     target: Target,
     starts: Sequence[BodyState],
     progress: Progress,
@@ -162,7 +170,7 @@ def _best_start(
     best, least = None, np.inf
     for start in starts[:_MOST_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, COARSE, observer=observer)
-        left = unexplained_share(model, coarse.vertices, target.tree)
+        left = unexplained_share(model, coarse.vertices, cloud)
         if left < least:
             best, least = coarse, left
         if least < _EXPLAINED:
@@ -187,13 +195,6 @@ def _refuse_absurd(cloud: PointCloud) -> None:
         )
 
 
-def _even_subset(count: int, wanted: int) -> NDArray[np.intp]:
-    """The same pseudo-random subset for the same count: same input, same output."""
-    if count <= wanted:
-        return np.arange(count)
-    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
-
-
 def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> dict[str, float]:
     """The rigid shift (m) that would bring each camera's points onto the common surface."""
     normals = vertex_normals(surface.vertices, model.faces)
@@ -201,7 +202,7 @@ def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> 
     shifts = {}
     for index, name in enumerate(cloud.camera_names):
         mine = np.flatnonzero(cloud.camera == index)
-        mine = mine[_even_subset(len(mine), 10 * _CAMERA_POINTS)]
+        mine = mine[even_subset(len(mine), 10 * _CAMERA_POINTS)]
         if len(mine) < _CAMERA_POINTS:
             continue
         vertex = tree.nearest(cloud.points[mine], cloud.normals[mine])

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree
-from workers.scape.model import BodyModel, BodyState, SampledBody
+from workers.scape.kernels import trimmed_costs
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.sampled import SampledBody
 
 Array = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ def _searched(
         tried[0] = best
         twists = hand.mean + tried @ hand.spread.T
         samples = _posed(model, hand, state, twists, local)
-        cost = _costs(samples, cloud, np.float32(_CUT_M), np.float32(_MODEL_SHARE))
+        cost = trimmed_costs(samples, cloud, _CUT_M, _CUT_M, _MODEL_SHARE)
         cost = cost + _PRIOR_M * np.sum(tried**2, axis=1)
         order = np.argsort(cost, kind="stable")
         if cost[order[0]] < least:
@@ -182,44 +183,14 @@ def _posed(
     """(h, n, 6): the samples and their scaled normals for twists (h, 9)."""
     body, parts = hand.body, list(hand.parts)
     count, tries = len(body.indices), len(twists)
-    columns = np.concatenate([1 + model.beta_count + np.arange(3 * (p - 1), 3 * p) for p in parts])
     now = model.relative_twists(state.rotations)[parts].ravel()
-    still = body.basis @ body.coefficients(state)
-    change = body.basis[..., columns].reshape(-1, len(columns))
-    arms = still.ravel()[:, None] + change @ (twists - now).T.astype(np.float32)
+    still, change = body.arms(state, parts)
+    carried = still.ravel()[:, None] + change.reshape(still.size, -1) @ (twists - now).T
     rotations = np.broadcast_to(state.rotations, (tries, *state.rotations.shape)).copy()
     rotations[:, parts] = _rotations(model, hand, state, twists)
     turning = np.swapaxes(rotations, 2, 3).reshape(tries, -1, 3).astype(np.float32)
-    arms = np.ascontiguousarray(arms.T).reshape(tries, count, -1)
+    arms = carried.T.astype(np.float32).reshape(tries, count, -1)
     positions = arms @ turning + state.translation.astype(np.float32)
     turns = rotations[:, hand.owner] @ np.swapaxes(state.rotations[hand.owner], 1, 2)
     turned = np.einsum("hnij,nj->hni", turns, normals)
     return np.concatenate([positions, _DIRECTION_SCALE_M * turned], axis=2).astype(np.float32)
-
-
-@numba.njit(cache=True, fastmath=True)
-def _costs(samples, cloud, cut, model_share):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(h,): trimmed mean distances cloud to samples and, by a share, samples to cloud."""
-    tries, count, _ = samples.shape
-    size = len(cloud)
-    result = np.empty(tries)
-    for h in range(tries):
-        back = np.full(count, np.float32(1e9))
-        total = 0.0
-        for p in range(size):
-            least = np.float32(1e9)
-            for s in range(count):
-                square = np.float32(0.0)
-                for k in range(6):
-                    difference = samples[h, s, k] - cloud[p, k]
-                    square += difference * difference
-                if square < least:
-                    least = square
-                if square < back[s]:
-                    back[s] = square
-            total += min(np.sqrt(least), cut)
-        other = 0.0
-        for s in range(count):
-            other += min(np.sqrt(back[s]), cut)
-        result[h] = total / size + model_share * other / count
-    return result

@@ -15,12 +15,14 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from station.depth import PointCloud
 from station.geometry import so3_exp
-from workers.scape.correspondence import OrientedTree, compatible
+from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.hands import Hand, hands_of
-from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
+from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
+from workers.scape.sampled import SampledBody, twist_chain
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,7 @@ _THUMB_STIFFNESS = 3.0
 _FLOOR_SIGMA_M = 0.004
 _SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
+_PULLED_POINTS = 5000
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -82,8 +85,7 @@ class Sampling:
     def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
         if count == _FINE:
             return self.body, self.fine_of_vertex
-        body = SampledBody(self.body.model, self.body.indices[:count], self.body.basis[:count])
-        return body, self.coarse_of_vertex
+        return self.body.first(count), self.coarse_of_vertex
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
@@ -104,12 +106,26 @@ def _spread(model: BodyModel) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The cloud as the fit uses it."""
+    """The cloud as the correspondences use it."""
 
     tree: OrientedTree
     sigma_m: Array
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
+
+    @classmethod
+    def build(cls, cloud: PointCloud, most_points: int) -> Target:
+        """An even subset of a cloud's points."""
+        used = even_subset(len(cloud), most_points)
+        tree = OrientedTree.build(cloud.points[used], cloud.normals[used])
+        return cls(tree, cloud.sigma_m[used], even_subset(len(used), _PULLED_POINTS))
+
+
+def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
+    """The same pseudo-random subset for the same count: same input, same output."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,28 +176,19 @@ def _data_terms(
     normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
     pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
-    mine = OrientedTree.build(vertices, normals).nearest(
-        cloud.points[pulled], cloud.normals[pulled]
-    )
-    stride = max(1, len(vertices) // (2 * stage.samples))
-    asking = np.arange(0, len(vertices), stride)
-    found = cloud.nearest(vertices[asking], normals[asking])
-    vertex = np.concatenate([mine, asking])
-    point = np.concatenate([pulled, found])
+    limits = {"max_distance_m": stage.gate_m, "max_angle_rad": stage.angle_rad}
+    body = OrientedTree.build(vertices, normals)
+    asking, mine = body.pairs(cloud.points[pulled], cloud.normals[pulled], **limits)
+    probes = np.arange(0, len(vertices), max(1, len(vertices) // (2 * stage.samples)))
+    probing, found = cloud.pairs(vertices[probes], normals[probes], **limits)
+    vertex = np.concatenate([mine, probes[probing]])
+    point = np.concatenate([pulled[asking], found])
     offsets = cloud.points[point] - vertices[vertex]
-    kept = compatible(
-        offsets,
-        normals[vertex],
-        cloud.normals[point],
-        max_distance_m=stage.gate_m,
-        max_angle_rad=stage.angle_rad,
-    )
-    vertex, offsets = vertex[kept], offsets[kept]
-    on_body, on_cloud = vertices[vertex], cloud.points[point[kept]]
+    on_body, on_cloud = vertices[vertex], cloud.points[point]
     observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
     direction = normals[vertex]
     residual = np.einsum("ni,ni->n", direction, offsets)
-    variance = target.sigma_m[point[kept]] ** 2 + _MODEL_SIGMA_M**2
+    variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
     row_weight = _ROW_SHARE * robust / variance
     floor_vertex, floor_pull, floor_weight = _floor_rows(vertices, normals, stage)

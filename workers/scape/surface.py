@@ -16,7 +16,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import cg
 
-from workers.scape.correspondence import OrientedTree, compatible
+from station.depth import PointCloud
+from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
 from workers.scape.model import BodyModel
 
@@ -53,12 +54,10 @@ class SurfaceFit:
     """(P,): mean signed distance of its points after the fit; NaN where there are none."""
 
 
-def fit_surface(
-    model: BodyModel, vertices: Array, cloud: OrientedTree, sigma_m: Array
-) -> SurfaceFit:
+def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    points, directions, noise = cloud.points[every], cloud.normals[every], sigma_m[every]
+    points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
     laplacian = model.solver.laplacian
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
@@ -94,18 +93,11 @@ def _gathered(
     angle_rad: float,
 ) -> tuple[Array, Array]:
     """Each vertex' mean distance (P,) to its points along the normal, and its information."""
-    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
-    offsets = points - vertices[vertex]
-    kept = compatible(
-        offsets,
-        normals[vertex],
-        directions,
-        max_distance_m=gate_m,
-        max_angle_rad=angle_rad,
+    used, vertex = OrientedTree.build(vertices, normals).pairs(
+        points, directions, max_distance_m=gate_m, max_angle_rad=angle_rad
     )
-    vertex, offsets = vertex[kept], offsets[kept]
-    distance = np.einsum("ni,ni->n", normals[vertex], offsets)
-    information = _INDEPENDENT / np.maximum(sigma_m[kept], _LEAST_SIGMA_M) ** 2
+    distance = np.einsum("ni,ni->n", normals[vertex], points[used] - vertices[vertex])
+    information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
     weight: Array = np.bincount(vertex, information, count).astype(np.float64)
     total: Array = np.bincount(vertex, information * distance, count).astype(np.float64)
