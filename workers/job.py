@@ -15,7 +15,9 @@ from station.depth import PointCloud, Preprocessed, Volume, preprocess
 from workers.export.result import write_result
 from workers.measure.body import measure_body
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
+from workers.scape.intersections import untangled
 from workers.scape.model import BodyModel, load_model
+from workers.scape.skeleton import joint_positions
 from workers.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
@@ -37,6 +39,8 @@ def warm_up() -> BodyModel:
 
     model = load_model()
     sampling_of(model)
+    untangled(model, model.mean, model.mean)
+    joint_positions(model, model.mean, model.neutral_state().rotations)
     compile_average()
     return model
 

@@ -165,10 +165,10 @@ def _cross(corners, faces, a, b):  # type: ignore[no-untyped-def]  # pragma: no 
         return False
     if shared == 1:
         return _pierces(corners, a, (at_a + 1) % 3, b) or _pierces(corners, b, (at_b + 1) % 3, a)
+    found = False
     for i in range(3):
-        if _pierces(corners, a, i, b) or _pierces(corners, b, i, a):
-            return True
-    return False
+        found = found or _pierces(corners, a, i, b) or _pierces(corners, b, i, a)
+    return found
 
 
 @numba.njit(cache=True)

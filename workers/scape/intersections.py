@@ -2,8 +2,8 @@
 
 Where the surface left the model's too abruptly (lips, ears, between fingers) it is the offset from
 the model that relaxes, so that the model's own shape stands there, carried by its surroundings.
-Where the model itself overlaps (an arm on the trunk, thighs) the surface relaxes instead: both sides
-of a contact flatten until they part. Patches grow only while they have to.
+Where the model itself overlaps (an arm on the trunk, thighs) the surface relaxes instead: both
+sides of a contact flatten until they part. Patches grow only while they have to.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
             best, fewest = current, count
         if count == 0:
             break
-        marked = np.zeros(len(vertices), bool)
-        marked[faces[bad]] = True
-        marked = _grown(marked, mean, 1)
+        corners = np.zeros(len(vertices), bool)
+        corners[faces[bad]] = True
+        marked = _grown(corners, mean, 1)
         trouble += marked
         patch = np.flatnonzero(_grown(marked, mean, 1 + round_ // _ROUNDS_A_RING))
         current = _relaxed(current, reference, patch, trouble[patch] > _STUBBORN_ROUNDS, mean)
