@@ -44,8 +44,9 @@ def test_two_triangles_cross_or_do_not() -> None:
     through = np.array([[0.2, 0.2, -0.5], [0.2, 0.2, 0.5], [0.9, 0.9, 0.5]])
     faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
     assert crossing_pairs(np.concatenate([one, through]), faces).tolist() == [[0, 1]]
-    assert len(crossing_pairs(np.concatenate([one, through + (0.0, 0.0, 0.6)]), faces)) == 0
-    assert len(crossing_pairs(np.concatenate([one, through + (3.0, 0.0, 0.0)]), faces)) == 0
+    for aside in ((0.0, 0.0, 0.6), (3.0, 0.0, 0.0)):
+        apart = through + np.array(aside)
+        assert len(crossing_pairs(np.concatenate([one, apart]), faces)) == 0
 
 
 def test_triangles_that_share_a_vertex_can_cross_beyond_it() -> None:

@@ -60,7 +60,7 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     current = best = vertices
     fewest = len(faces)
     trouble = np.zeros(len(vertices), np.int64)
-    asking = np.ones(len(faces), bool)
+    asking: Mask = np.ones(len(faces), bool)
     for round_ in range(_MOST_ROUNDS):
         bad = turned_over(current, reference, faces)
         bad[crossing_pairs(current, faces, asking).ravel()] = True
@@ -77,7 +77,7 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
         current = _relaxed(current, reference, patch, trouble[patch] > _STUBBORN_ROUNDS, mean)
         moved = np.zeros(len(vertices), bool)
         moved[patch] = True
-        asking = moved[faces].any(axis=1)
+        asking = np.asarray(moved[faces].any(axis=1))
     return best
 
 
