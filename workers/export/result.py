@@ -45,7 +45,7 @@ def write_result(
             "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
             "cloud.ply": ply_cloud(cloud.points, cloud.normals),
             "measurements.json": _json(measurements_document(scan_id, measurements)),
-            "preview.png": preview(fit.vertices, faces, measurements),
+            "preview.png": preview(fit.vertices, faces, measurements, fit.verdict),
         }
         for name, content in files.items():
             (folder / name).write_bytes(content)
