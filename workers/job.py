@@ -84,7 +84,9 @@ def reconstruct_cloud(
     watch = Stopwatch()
     with watch.step("load"):
         model = model or load_model()
-    fit = fit_body(model, Preprocessed(cloud, (), ()), method=method, progress=progress)
+    with watch.step("preprocess"):
+        scan = Preprocessed(cloud, (), ())
+    fit = fit_body(model, scan, method=method, progress=progress)
     return _finish(model, fit, cloud, scan_id, method, out_folder, watch, progress)
 
 

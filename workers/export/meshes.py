@@ -39,7 +39,7 @@ def obj_mesh(vertices: Array, faces: Faces) -> bytes:
     out = io.StringIO()
     out.write("# metres, z up\n")
     normals = vertex_normals(vertices, faces)
-    out.write(("v %.5f %.5f %.5f\n" * len(vertices)) % tuple(vertices.ravel()))
+    out.write(("v %.6f %.6f %.6f\n" * len(vertices)) % tuple(vertices.ravel()))
     out.write(("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()))
     corners = np.repeat(faces.ravel() + 1, 2)
     out.write(("f %d//%d %d//%d %d//%d\n" * len(faces)) % tuple(corners))
