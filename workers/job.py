@@ -17,6 +17,7 @@ from workers.measure.body import measure_body
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
 from workers.scape.intersections import untangled
 from workers.scape.model import BodyModel, load_model
+from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
 from workers.stopwatch import Stopwatch
 
@@ -53,6 +54,7 @@ def reconstruct_bundle(
     model: BodyModel | None = None,
     volume: Volume | None = None,
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JobSummary:
     """Reconstruct a scan bundle into a folder that exists and is empty.
 
@@ -67,7 +69,7 @@ def reconstruct_bundle(
     progress("filtering", 0.0)
     with watch.step("preprocess"):
         scan = preprocess(bundle, volume)
-    fit = fit_body(model, scan, method=method, progress=progress)
+    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
     return _finish(model, fit, scan.cloud, bundle.scan_id, method, out_folder, watch, progress)
 
 
@@ -79,6 +81,7 @@ def reconstruct_cloud(
     method: Method = "joint",
     model: BodyModel | None = None,
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JobSummary:
     """Reconstruct a bare cloud, from any scanner."""
     watch = Stopwatch()
@@ -86,7 +89,7 @@ def reconstruct_cloud(
         model = model or load_model()
     with watch.step("preprocess"):
         scan = Preprocessed(cloud, (), ())
-    fit = fit_body(model, scan, method=method, progress=progress)
+    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
     return _finish(model, fit, cloud, scan_id, method, out_folder, watch, progress)
 
 
