@@ -219,12 +219,31 @@ def _arm(t: _Template) -> dict[str, int]:
     # The head of the ulna stands out a little before the narrowest place.
     ring = np.concatenate([fore, hand])
     ring = ring[np.abs((v[ring] - wrist) @ along + 0.008) < 0.008]
-    knuckles = t.border("hand_left", "fingers_left")
+    tip = t.extreme(t.of("fingers_left"), t.border("hand_left", "fingers_left") - wrist)
+    knuckle, finger_joint = _back_of_finger(t, tip)
     return {
         "elbow": t.extreme(near_elbow, (0.25, 0.95, 0.1)),
         "wrist": t.extreme(ring, ulnar),
-        "fingertip": t.extreme(t.of("fingers_left"), knuckles - wrist),
+        "knuckle": knuckle,
+        "finger_joint": finger_joint,
+        "fingertip": tip,
     }
+
+
+def _back_of_finger(t: _Template, tip: int) -> tuple[int, int]:
+    """Two vertices on the back of the finger with this tip: where it starts, and its middle."""
+    v = t.v
+    fingers = t.of("fingers_left")
+    end = v[fingers[np.linalg.norm(v[fingers] - v[tip], axis=1) < 0.03]]
+    direction = np.linalg.svd(end - end.mean(axis=0))[2][0]
+    direction *= np.sign(direction @ (v[fingers].mean(axis=0) - v[tip]))
+    offset = v[fingers] - end.mean(axis=0)
+    aside = np.linalg.norm(offset - np.outer(offset @ direction, direction), axis=1)
+    finger = fingers[aside < 0.010]
+    along = (v[finger] - v[tip]) @ direction
+    start = finger[along > along.max() - 0.008]
+    middle = finger[np.abs(along - 0.5 * along.max()) < 0.006]
+    return t.extreme(start, _LEFT), t.extreme(middle, _LEFT)
 
 
 def _leg(t: _Template) -> dict[str, int]:
