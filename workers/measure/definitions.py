@@ -20,7 +20,9 @@ Leg = Literal["skin", "tape", "straight", "floor"]
 """How a route goes on: along the skin; along the skin but taut over hollows; straight through the
 air; straight down to the floor, which ends the route.
 
-Skin and tape run in the plane that holds both ends and the mean of their normals."""
+Skin and tape run in the plane that holds both ends and the mean of their normals, on the side that
+the normals point to; what the plane cuts farther from the straight line than a tenth of its length
+below it or 0.45 of its length above it is another part of the body."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ def learned(errors: Array, sigmas: Array) -> ErrorModel:
     doubt = float(errors[kept].var(ddof=1)) / int(kept.sum())
     bias = mean * max(0.0, 1.0 - doubt / max(mean**2, 1e-30))
     residual = errors - bias
-    typical = float(np.median(sigmas))
+    typical = max(float(np.median(sigmas)), 1e-9)
     best, most = _RATIOS[0], -np.inf
     for ratio in _RATIOS:
         shape = np.hypot(1.0, ratio * sigmas / typical)[kept]

@@ -127,8 +127,9 @@ def loop_length(points: Array, *, closed: bool) -> float:
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-_BELOW_M = 0.02
-_ABOVE_M = 0.08
+BELOW_CHORD, ABOVE_CHORD = 0.10, 0.45
+"""What lies farther from the straight line than these shares of its length is another part of the
+body."""
 
 
 def surface_order(
@@ -136,8 +137,7 @@ def surface_order(
 ) -> Index:
     """Which of the points (n, 3) of a section lie between start and end on the outer side, in order.
 
-    The section is that of the plane of both ends and of `outward`. What lies more than 2 cm below
-    or 8 cm above the straight line is another part of the body. A taut tape skips hollows.
+    The section is that of the plane of both ends and of `outward`. A taut tape skips hollows.
     """
     along = end - start
     length = float(np.linalg.norm(along))
@@ -145,7 +145,7 @@ def surface_order(
     up = outward - along * (outward @ along)
     up = up / np.linalg.norm(up)
     x, y = (points - start) @ along, (points - start) @ up
-    order = np.flatnonzero((x > 0.0) & (x < length) & (y > -_BELOW_M) & (y < _ABOVE_M))
+    order = np.flatnonzero((x > 0.0) & (x < length) & (y > -BELOW_CHORD * length) & (y < ABOVE_CHORD * length))
     order = order[np.argsort(x[order], kind="stable")]
     if not taut:
         return order

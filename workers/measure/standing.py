@@ -60,10 +60,24 @@ def standard_state(model: BodyModel, beta: Array) -> BodyState:
 
 
 def stood_upright(model: BodyModel, vertices: Array, state: BodyState) -> Array:
-    """A fitted surface (P, 3) in the standard pose, with its soles on the floor."""
-    standing = model.repose(vertices, state, standard_state(model, state.beta))
-    standing[:, 2] -= standing[:, 2].min()
-    return standing
+    """A fitted surface (P, 3) in the standard pose, on the floor."""
+    return on_both_feet(model, model.repose(vertices, state, standard_state(model, state.beta)))
+
+
+def on_both_feet(model: BodyModel, vertices: Array) -> Array:
+    """A body (P, 3) set on the floor by the mean height of its two soles, which is as on the mean
+    body: legs are never quite alike, and who stands on both feet evens that out in the hips.
+
+    A sole is the lowest fifth of a foot's vertices.
+    """
+    lift = np.mean([_sole(model, vertices, part) for part in ("foot_left", "foot_right")])
+    usual = np.mean([_sole(model, model.mean, part) for part in ("foot_left", "foot_right")])
+    return np.asarray(vertices - (0.0, 0.0, lift - usual))
+
+
+def _sole(model: BodyModel, vertices: Array, part: str) -> float:
+    height = np.sort(vertices[model.part_of_vertex == model.part_names.index(part), 2])
+    return float(height[: len(height) // 5].mean())
 
 
 def _turn(direction: Array, target: Array) -> Array:
