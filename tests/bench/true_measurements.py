@@ -109,9 +109,7 @@ class TrueBody:
         cut = above.any(axis=1) & ~above.all(axis=1)
         corners, height, above = corners[cut], height[cut], above[cut]
         # The corner that is alone on its side, and the two others.
-        alone = np.where(
-            above.sum(axis=1) == 1, np.argmax(above, axis=1), np.argmin(above, axis=1)
-        )
+        alone = np.where(above.sum(axis=1) == 1, np.argmax(above, axis=1), np.argmin(above, axis=1))
         index = np.arange(len(alone))
         ends = []
         for step in (1, 2):

@@ -130,7 +130,7 @@ def _height(name: str, words: str, landmark: str, standard: str = "") -> Definit
 
 
 def _distance(name: str, words: str, landmarks: tuple[str, ...], standard: str = "") -> Definition:
-    straight: tuple[Leg, ...] = ("straight",) * (len(landmarks) - 1)
+    straight: tuple[Leg, ...] = tuple("straight" for _ in landmarks[1:])
     return Definition(name, words, "distance", Route(landmarks, straight), standard)
 
 
@@ -141,7 +141,8 @@ def _heights() -> tuple[Definition, ...]:
         _height("chin_height", "chin above the floor", "chin"),
         _height("shoulder_height", "right shoulder point above the floor", "acromion_right", _BODY),
         _height("bust_height", "right bust point above the floor", "bust_right", _CLOTHES),
-        _height("waist_height", "natural waist, in front, above the floor", "waist_front", _CLOTHES),
+        _height("waist_height", "front of the natural waist above the floor", "waist_front",
+                _CLOTHES),
         _height("hip_height", "right buttock's farthest point above the floor", "buttock_right",
                 _CLOTHES),
         _height("crotch_height", "inside leg: crotch above the floor", "crotch", _BODY),
@@ -240,7 +241,8 @@ def _trunk_lengths() -> tuple[Definition, ...]:
         _distance("bust_point_width", "bust point to bust point, straight", _BUST, _CLOTHES),
         Definition(
             "back_waist_length", "seventh neck vertebra to the waist, following the back's curve",
-            "length", Route(("cervicale", "waist_back"), ("skin",), ("neck", *TRUNK)), f"{_CLOTHES} 5.4.5",
+            "length", Route(("cervicale", "waist_back"), ("skin",), ("neck", *TRUNK)),
+            f"{_CLOTHES} 5.4.5",
         ),
         Definition(
             "front_waist_length", "pit of the neck to the waist, along the front", "length",

@@ -132,10 +132,8 @@ BELOW_CHORD, ABOVE_CHORD = 0.10, 0.45
 body."""
 
 
-def surface_order(
-    points: Array, start: Array, end: Array, outward: Array, *, taut: bool
-) -> Index:
-    """Which of the points (n, 3) of a section lie between start and end on the outer side, in order.
+def surface_order(points: Array, start: Array, end: Array, outward: Array, *, taut: bool) -> Index:
+    """Which of the points (n, 3) of a section lie outside between start and end, in order.
 
     The section is that of the plane of both ends and of `outward`. A taut tape skips hollows.
     """
@@ -145,7 +143,9 @@ def surface_order(
     up = outward - along * (outward @ along)
     up = up / np.linalg.norm(up)
     x, y = (points - start) @ along, (points - start) @ up
-    order = np.flatnonzero((x > 0.0) & (x < length) & (y > -BELOW_CHORD * length) & (y < ABOVE_CHORD * length))
+    order = np.flatnonzero(
+        (x > 0.0) & (x < length) & (y > -BELOW_CHORD * length) & (y < ABOVE_CHORD * length)
+    )
     order = order[np.argsort(x[order], kind="stable")]
     if not taut:
         return order

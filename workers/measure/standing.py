@@ -54,9 +54,7 @@ def standard_state(model: BodyModel, beta: Array) -> BodyState:
     twists = np.zeros((model.part_count, 3))
     for part, turn in standard_turns(model).items():
         twists[model.part_names.index(part)] = turn
-    return BodyState(
-        model.absolute_rotations(twists), beta, np.asarray(model.anchor @ model.mean)
-    )
+    return BodyState(model.absolute_rotations(twists), beta, np.asarray(model.anchor @ model.mean))
 
 
 def stood_upright(model: BodyModel, vertices: Array, state: BodyState) -> Array:
@@ -72,7 +70,7 @@ def on_both_feet(model: BodyModel, vertices: Array) -> Array:
     """
     lift = np.mean([_sole(model, vertices, part) for part in ("foot_left", "foot_right")])
     usual = np.mean([_sole(model, model.mean, part) for part in ("foot_left", "foot_right")])
-    return np.asarray(vertices - (0.0, 0.0, lift - usual))
+    return np.asarray(vertices - np.array([0.0, 0.0, lift - usual]))
 
 
 def _sole(model: BodyModel, vertices: Array, part: str) -> float:
@@ -86,4 +84,3 @@ def _turn(direction: Array, target: Array) -> Array:
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)
     return np.asarray(axis / max(sine, 1e-12) * np.arctan2(sine, a @ b))
-

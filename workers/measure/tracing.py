@@ -154,9 +154,7 @@ class _Tracer:
         if section.across is None:
             return loop_length(places, closed=True), points, True
         side, other = section.across
-        breadth, depth = plane_axes(
-            self._plane(section.plane)[1], self._at(other) - self._at(side)
-        )
+        breadth, depth = plane_axes(self._plane(section.plane)[1], self._at(other) - self._at(side))
         reach = places @ (breadth if definition.quantity == "breadth" else depth)
         low, high = int(np.argmin(reach)), int(np.argmax(reach))
         ends = points.take(np.array([low, high]))
@@ -174,15 +172,11 @@ class _Tracer:
             pieces.pop()
         return EdgePoints.joined(pieces)
 
-    def _over_skin(
-        self, parts: tuple[str, ...], start: int, end: int, *, taut: bool
-    ) -> EdgePoints:
+    def _over_skin(self, parts: tuple[str, ...], start: int, end: int, *, taut: bool) -> EdgePoints:
         ends = self._vertices[start], self._vertices[end]
         outward = self._normals[start] + self._normals[end]
         normal = np.cross(ends[1] - ends[0], outward)
         normal /= np.linalg.norm(normal)
         found, _ = _net(self._model, parts).cut(self._vertices, ends[0], normal)
-        order: Index = surface_order(
-            found.on(self._vertices), *ends, outward, taut=taut
-        )
+        order: Index = surface_order(found.on(self._vertices), *ends, outward, taut=taut)
         return found.take(order)
