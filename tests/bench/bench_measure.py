@@ -10,6 +10,7 @@ each camera off its calibration by up to 1 mm and 0.05 degrees.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import tempfile
 import time
@@ -100,7 +101,8 @@ class Studio:
         body = self._database.vertices(shapes, pose[None])[0]
         middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
         body = body - (*(middle[:2] + rng.uniform(-0.03, 0.03, 2)), 0.0)
-        bundle = self._folder / name
+        # Another body database renders other bodies: never take one for the other.
+        bundle = self._folder / f"{name}-{hashlib.sha256(body.tobytes()).hexdigest()[:12]}"
         if not bundle.exists():
             booth = SimulatedBooth(
                 seed=seed,

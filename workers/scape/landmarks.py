@@ -15,6 +15,8 @@ Pool = NDArray[np.intp]
 
 _ACROMION_HALF_BREADTH = 0.115
 """Half the biacromial breadth, as a share of the stature."""
+_WAIST_HEIGHT = 0.628
+"""Midway from the lowest rib to the top of the hip bone, as a share of the stature."""
 _MALLEOLUS_HEIGHT = 0.040
 """Outer ankle bone above the floor, as a share of the stature."""
 _FRONT = (0.0, -1.0, 0.0)
@@ -64,7 +66,7 @@ def find_landmarks(vertices: Array, parts: list[str], owner: NDArray[np.intp]) -
     """Landmark -> vertex of a symmetric template (P, 3) whose vertices belong to parts (P,)."""
     t = _Template(vertices, parts, owner)
     found = _head_and_neck(t)
-    found |= _trunk(t, vertices[found["cervicale"], 2])
+    found |= _trunk(t)
     left = _shoulder(t) | _arm(t) | _leg(t) | _flank(t, found)
     every = np.arange(len(vertices))
     for name, vertex in left.items():
@@ -109,28 +111,18 @@ def _head_and_neck(t: _Template) -> dict[str, int]:
     }
 
 
-def _trunk(t: _Template, neck_z: float) -> dict[str, int]:
+def _trunk(t: _Template) -> dict[str, int]:
     v = t.v
     middle = t.middle(t.of("pelvis", "abdomen", "chest"))
     crotch = t.extreme(middle, _DOWN)
     depth = float(np.median(v[middle, 1]))
     front, back = middle[v[middle, 1] < depth], middle[v[middle, 1] > depth]
-    waist_z = _waist_level(t, v[crotch, 2], neck_z)
+    waist_z = _WAIST_HEIGHT * t.stature
     return {
         "crotch": crotch,
         "waist_front": t.nearest(front, (0.0, v[front, 1].min(), waist_z)),
         "waist_back": t.nearest(back, (0.0, v[back, 1].max(), waist_z)),
     }
-
-
-def _waist_level(t: _Template, crotch_z: float, neck_z: float) -> float:
-    """The height where the trunk is narrowest from side to side: between ribs and hip bones."""
-    trunk = t.of("abdomen", "chest", "pelvis")
-    levels = np.linspace(0.33, 0.52, 20) * (neck_z - crotch_z) + crotch_z
-    # The widest vertex within a ring of the mesh, smoothed: a level may fall between two rings.
-    widths = [np.sort(t.v[t.level(trunk, z, 0.015), 0])[-3:].mean() for z in levels]
-    smooth = np.convolve(np.pad(widths, 2, mode="edge"), np.full(5, 0.2), mode="valid")
-    return float(levels[np.argmin(smooth)])
 
 
 def _flank(t: _Template, found: dict[str, int]) -> dict[str, int]:
@@ -221,8 +213,11 @@ def _arm(t: _Template) -> dict[str, int]:
     ring = ring[np.abs((v[ring] - wrist) @ along + 0.008) < 0.008]
     tip = t.extreme(t.of("fingers_left"), t.border("hand_left", "fingers_left") - wrist)
     knuckle, finger_joint = _back_of_finger(t, tip)
+    # The tip of the bent elbow: away from shoulder and wrist alike.
+    shoulder = t.border("shoulder_left", "upper_arm_left") - joint
+    outwards = -(shoulder / np.linalg.norm(shoulder) + along)
     return {
-        "elbow": t.extreme(near_elbow, (0.25, 0.95, 0.1)),
+        "elbow": t.extreme(near_elbow, outwards),
         "wrist": t.extreme(ring, ulnar),
         "knuckle": knuckle,
         "finger_joint": finger_joint,
