@@ -21,6 +21,7 @@ from workers.scape.initial import starting_states
 from workers.scape.joint import (
     COARSE,
     FINE,
+    MIDDLE,
     JointResult,
     Sampling,
     Target,
@@ -44,7 +45,7 @@ Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
-_TREE_POINTS = 30_000
+_TREE_POINTS = 60_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
@@ -176,11 +177,13 @@ def _best_start(
         if least < _EXPLAINED:
             break
     assert best is not None
-    normals = vertex_normals(best.vertices, model.faces)
-    state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
-    return fit_jointly(
-        model, sampling, target, state, FINE, lambda share: progress("icp", share), observer
-    )
+    for schedule in (MIDDLE, FINE):
+        normals = vertex_normals(best.vertices, model.faces)
+        state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
+        best = fit_jointly(
+            model, sampling, target, state, schedule, lambda share: progress("icp", share), observer
+        )
+    return best
 
 
 def _refuse_absurd(cloud: PointCloud) -> None:

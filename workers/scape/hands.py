@@ -180,7 +180,7 @@ def _rotations(model: BodyModel, hand: Hand, state: BodyState, twists: Array) ->
 def _posed(
     model: BodyModel, hand: Hand, state: BodyState, twists: Array, normals: Array
 ) -> NDArray[np.float32]:
-    """(h, n, 6): the samples and their scaled normals for twists (h, 9)."""
+    """(h, 6, n): the samples and their scaled normals for twists (h, 9)."""
     body, parts = hand.body, list(hand.parts)
     count, tries = len(body.indices), len(twists)
     now = model.relative_twists(state.rotations)[parts].ravel()
@@ -193,4 +193,5 @@ def _posed(
     positions = arms @ turning + state.translation.astype(np.float32)
     turns = rotations[:, hand.owner] @ np.swapaxes(state.rotations[hand.owner], 1, 2)
     turned = np.einsum("hnij,nj->hni", turns, normals)
-    return np.concatenate([positions, _DIRECTION_SCALE_M * turned], axis=2).astype(np.float32)
+    joined = np.concatenate([positions, _DIRECTION_SCALE_M * turned], axis=2)
+    return np.ascontiguousarray(joined.swapaxes(1, 2), np.float32)

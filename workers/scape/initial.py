@@ -93,6 +93,10 @@ def _placed(
 def _costs(bodies: Array, points: Array) -> Array:
     """Trimmed two-way distances: the cloud must be explained, the body need not all be seen."""
     found = trimmed_costs(
-        bodies.astype(np.float32), points.astype(np.float32), 2 * _TRIM_M, _TRIM_M, 1.0
+        np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
+        points.astype(np.float32),
+        2 * _TRIM_M,
+        _TRIM_M,
+        1.0,
     )
     return np.asarray(found)

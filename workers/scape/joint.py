@@ -28,13 +28,12 @@ Array = NDArray[np.float64]
 
 _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
-_ROW_SHARE = 0.12
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
 _FLOOR_SIGMA_M = 0.004
 _SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
-_PULLED_POINTS = 5000
+_PULLED_POINTS = 10_000
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -49,17 +48,18 @@ class Stage:
     angle_rad: float
     scale_m: float
     """Of the robust weight: residuals beyond it lose their pull."""
+    row_share: float
+    """What one row counts: neighbours share what the model cannot express. Low at first, so that
+    the prior carries the face and the hands as they are to where they belong."""
 
 
 COARSE = (
-    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060) for _ in range(4)),
-    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030) for _ in range(4)),
-    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018) for _ in range(3)),
+    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
+    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030, 0.06) for _ in range(4)),
+    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018, 0.06) for _ in range(3)),
 )
-FINE = (
-    *(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010) for _ in range(3)),
-    *(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006) for _ in range(2)),
-)
+MIDDLE = tuple(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010, 0.06) for _ in range(2))
+FINE = tuple(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006, 0.60) for _ in range(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ def _data_terms(
     residual = np.einsum("ni,ni->n", direction, offsets)
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    row_weight = _ROW_SHARE * robust / variance
+    row_weight = stage.row_share * robust / variance
     floor_vertex, floor_pull, floor_weight = _floor_rows(vertices, normals, stage)
     vertex = np.concatenate([vertex, floor_vertex])
     direction = np.concatenate([direction, np.tile((0.0, 0.0, 1.0), (len(floor_vertex), 1))])

@@ -119,23 +119,26 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
     tried_share times the mean the other way round, each at most tried_cut.
 
     Args:
-        tried: (h, n, k) float32.
+        tried: (h, k, n) float32: k coordinates of n points.
         cloud: (m, k) float32.
     """
-    tries, count, size = tried.shape
+    tries, size, count = tried.shape
     result = np.empty(tries)
+    square = np.empty(count, np.float32)
     for h in range(tries):
         back = np.full(count, np.float32(1e9))
         total = 0.0
         for p in range(len(cloud)):
+            square[:] = 0.0
+            for k in range(size):
+                here = cloud[p, k]
+                for s in range(count):
+                    difference = tried[h, k, s] - here
+                    square[s] += difference * difference
             least = np.float32(1e9)
             for s in range(count):
-                square = np.float32(0.0)
-                for k in range(size):
-                    difference = tried[h, s, k] - cloud[p, k]
-                    square += difference * difference
-                least = min(least, square)
-                back[s] = min(back[s], square)
+                least = min(least, square[s])
+                back[s] = min(back[s], square[s])
             total += min(np.sqrt(least), cloud_cut)
         other = 0.0
         for s in range(count):
