@@ -7,7 +7,7 @@ share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +15,15 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from station.depth import PointCloud
+from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
+from workers.scape.free_space import FreeSpace
 from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
+from workers.scape.rows import Rows, floor_rows, outline_rows
 from workers.scape.sampled import SampledBody, twist_chain
 
 Array = NDArray[np.float64]
@@ -30,8 +32,6 @@ _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
-_FLOOR_SIGMA_M = 0.004
-_SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
 _PULLED_POINTS = 10_000
 _EVERY = 1 << 20
@@ -112,13 +112,19 @@ class Target:
     sigma_m: Array
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
+    free_space: FreeSpace
 
     @classmethod
-    def build(cls, cloud: PointCloud, most_points: int) -> Target:
+    def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
         """An even subset of a cloud's points."""
         used = even_subset(len(cloud), most_points)
         tree = OrientedTree.build(cloud.points[used], cloud.normals[used])
-        return cls(tree, cloud.sigma_m[used], even_subset(len(used), _PULLED_POINTS))
+        return cls(
+            tree,
+            cloud.sigma_m[used],
+            even_subset(len(used), _PULLED_POINTS),
+            FreeSpace.build(views),
+        )
 
 
 def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
@@ -191,31 +197,14 @@ def _data_terms(
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
     row_weight = stage.row_share * robust / variance
-    floor_vertex, floor_pull, floor_weight = _floor_rows(vertices, normals, stage)
-    vertex = np.concatenate([vertex, floor_vertex])
-    direction = np.concatenate([direction, np.tile((0.0, 0.0, 1.0), (len(floor_vertex), 1))])
-    residual = np.concatenate([residual, floor_pull])
-    row_weight = np.concatenate([row_weight, floor_weight])
-    sample = sample_of_vertex[vertex]
-    weight = np.zeros((samples, 9))
-    outer = (direction[:, :, None] * direction[:, None, :]).reshape(-1, 9)
-    for column in range(9):
-        weight[:, column] = np.bincount(sample, row_weight * outer[:, column], samples)
-    pull: Array = np.zeros((samples, 3))
-    for i in range(3):
-        pull[:, i] = np.bincount(sample, row_weight * residual * direction[:, i], samples)
-    return weight.reshape(-1, 3, 3), pull, len(residual)
-
-
-def _floor_rows(
-    vertices: Array, normals: Array, stage: Stage
-) -> tuple[NDArray[np.intp], Array, Array]:
-    """The soles stand on z = 0, which no camera sees; nothing lies below it."""
-    band = max(_SOLE_BAND_M, 0.5 * stage.gate_m)
-    down = (normals[:, 2] < -0.8) & (vertices[:, 2] < _SOLE_BAND_M)
-    touching = np.flatnonzero((down & (vertices[:, 2] > -band)) | (vertices[:, 2] < 0.0))
-    pull = -vertices[touching, 2]
-    return touching, pull, np.full(len(touching), 0.02 / _FLOOR_SIGMA_M**2)
+    rows = [
+        Rows(vertex, direction, residual, row_weight),
+        floor_rows(vertices, normals, 0.5 * stage.gate_m),
+    ]
+    if stage.samples != _COARSE:
+        rows.append(outline_rows(model, target.free_space, vertices, stage.row_share))
+    weight, pull = Rows.joined(*rows).at_samples(sample_of_vertex, samples)
+    return weight, pull, len(vertex)
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,6 +114,12 @@ class BodyModel:
         weights = self.vertex_weights[:, 0] * vertex_areas(self.mean, self.faces)
         return np.asarray(weights / weights.sum())
 
+    @cached_property
+    def vertex_shares(self) -> Array:
+        """(P,): the area that each vertex stands for, 1 on average."""
+        areas = vertex_areas(self.mean, self.faces)
+        return np.asarray(areas / areas.mean())
+
     def part_laplacian(self, part: int) -> sp.csr_matrix:
         """L_p (P, P): the Laplacian with every triangle weighted by its share in the part."""
         solver = self.solver
