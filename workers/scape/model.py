@@ -64,8 +64,6 @@ class BodyModel:
     """(L,): index of the parent, which comes earlier; -1 for the root."""
     vertex_weights: Array
     """(P, L): skin weights, rows sum to 1."""
-    joints: Array
-    """(L, 3): where each part turns against its parent on the mean body."""
     mean: Array
     """(P, 3): the mean body in the neutral pose, standing on z = 0, facing -y."""
     directions: Array32
@@ -304,7 +302,6 @@ def _from_fields(fields: dict[str, Any], metadata: dict[str, Any], sha256: str) 
         part_names=tuple(metadata["parts"]),
         part_parents=fields["part_parents"].astype(np.int32),
         vertex_weights=weights / weights.sum(axis=1, keepdims=True),
-        joints=fields["joints"].astype(np.float64),
         mean=fields["mean"].astype(np.float64),
         directions=fields["directions"].astype(np.float32) * scale[:, None, None],
         pose_fields=pose_fields,
