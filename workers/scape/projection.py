@@ -17,7 +17,7 @@ PROJECTION_STRIDE = 5
 _STEPS = 8
 _SETTLED_M = 2e-5
 _NOISE_M = 1e-3
-"""Against beta ~ N(0, I): as if each sample were known to a millimetre, so the prior barely acts."""
+"""Of each sample, against beta ~ N(0, I): the prior barely acts."""
 _MOST_TURN_RAD = 0.5
 
 

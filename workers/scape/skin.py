@@ -164,10 +164,10 @@ def _filled(vertices: Array, loop: NDArray[np.int64]) -> Faces:
     triangles = []
     sections = [(0, count - 1)]
     while sections:
-        first, last = sections.pop()
-        if last - first < 2:
+        start, end = sections.pop()
+        if end - start < 2:
             continue
-        middle = int(apex[first, last])
-        triangles.append((first, middle, last))
-        sections += [(first, middle), (middle, last)]
+        tip = int(apex[start, end])
+        triangles.append((start, tip, end))
+        sections += [(start, tip), (tip, end)]
     return np.asarray(loop[np.array(triangles)], dtype=np.int32)
