@@ -98,10 +98,7 @@ _FAT = {
     "upperleg-fat-incr": "hips",
     "measure-bust-circ-incr": "all",
     "measure-upperarm-circ-incr": "all",
-    "upperarm-fat-incr": "all",
-    "lowerarm-fat-incr": "all",
     "measure-calf-circ-incr": "all",
-    "measure-knee-circ-incr": "all",
     "lowerleg-fat-incr": "all",
     "measure-neck-circ-incr": "all",
     "neck-double-incr": "all",
@@ -332,7 +329,7 @@ class BodyDatabase:
                 value = value + 0.12 * rng.standard_normal(count) * intensity
             elif "trans-out" in base or base in ("head-angle-out", "nose-trans-out"):
                 value = 0.3 * value  # these are asymmetries themselves
-            changes[label] = np.clip(value, -1.0, 1.4 if base in _FAT else 1.0)
+            changes[label] = np.clip(value, -1.0, 1.2 if base in _FAT else 1.0)
         local = {label: changes[label] for label in labels}
         return Shapes(phenotypes, local, np.ones(count))
 
@@ -352,15 +349,16 @@ class BodyDatabase:
             return np.radians(deviation_deg) * np.clip(rng.standard_normal(count), -2.5, 2.5)
 
         for bone in ("spine04", "spine02", "neck01", "neck03"):
-            for axis, deviation in ((0, 4.0), (1, 3.0), (2, 3.0)):
+            bends = (4.0, 3.0, 3.0) if bone.startswith("spine") else (6.0, 4.0, 5.0)
+            for axis, deviation in enumerate(bends):
                 turn(bone, axis, spread(deviation))
-        common_arm = rng.uniform(10.0, 80.0, count)
-        common_leg = rng.uniform(-3.0, 13.0, count)
+        common_arm = rng.uniform(8.0, 80.0, count)
+        common_leg = rng.uniform(-3.0, 15.0, count)
         for side, sign in (("L", 1.0), ("R", -1.0)):
             # The neutral arm hangs 43 degrees from the trunk; about y, positive lowers the left.
-            arm = np.clip(common_arm + 6.0 * rng.standard_normal(count), 8.0, 85.0)
+            arm = np.clip(common_arm + 6.0 * rng.standard_normal(count), 5.0, 85.0)
             lower = np.radians(43.0 - arm)
-            turn(f"clavicle.{side}", 1, sign * 0.15 * lower + spread(3.0))
+            turn(f"clavicle.{side}", 1, sign * 0.15 * lower + spread(4.0))
             turn(f"clavicle.{side}", 2, spread(3.0))
             turn(f"upperarm01.{side}", 1, sign * 0.85 * lower)
             turn(f"upperarm01.{side}", 0, np.radians(rng.uniform(-10.0, 30.0, count)))
@@ -375,7 +373,7 @@ class BodyDatabase:
             for i in range(3):
                 turn(f"lowerarm02.{side}", i, along[i] * twist)
             for i in range(3):
-                turn(f"wrist.{side}", i, spread(8.0))
+                turn(f"wrist.{side}", i, spread(10.0))
             fist = np.where(rng.random(count) < 0.5, rng.random(count), 0.15 * rng.random(count))
             for finger in range(2, 6):
                 curl_axis = np.array([0.55, sign * 0.75, sign * -0.3])
