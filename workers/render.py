@@ -17,7 +17,7 @@ VIEWS = {
 }
 """View -> (which world direction points right in the picture, where the camera looks)."""
 _LIGHT = np.array([0.35, -0.35, 0.87])
-_SKIN: Array = np.array([196, 208, 224], float)
+_SKIN = np.array([196, 208, 224], float)
 _BACKGROUND = 250
 
 
@@ -30,12 +30,8 @@ def render_mesh(
     height: int,
     meters_per_pixel: float,
     center: Array,
-    colors: Array | None = None,
 ) -> Picture:
-    """An upright parallel projection (height, width, 3) of a mesh in the z-up world.
-
-    `colors` (K, 3), blue, green and red up to 255, is what its triangles are painted with.
-    """
+    """An upright parallel projection (height, width, 3) of a mesh in the z-up world."""
     right, forward = (np.array(axis) for axis in VIEWS[view])
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
@@ -53,10 +49,7 @@ def render_mesh(
     normals = found["primitive_normals"].numpy()
     headlight = np.abs(normals @ forward)
     shade = 0.30 + 0.50 * headlight + 0.20 * np.clip(normals @ _LIGHT, 0.0, 1.0)
-    skin = _SKIN
-    if colors is not None:
-        skin = colors[np.where(hit, found["primitive_ids"].numpy(), 0)]
-    picture = np.where(hit[..., None], shade[..., None] * skin, _BACKGROUND)
+    picture = np.where(hit[..., None], shade[..., None] * _SKIN, _BACKGROUND)
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 
