@@ -13,7 +13,8 @@ import numpy as np
 
 from station import __version__
 from station.depth import PointCloud
-from workers.export.meshes import glb_mesh, obj_mesh, ply_cloud, ply_mesh
+from workers.export.gltf import avatar_glb, mesh_glb
+from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.preview import preview
 from workers.measure.body import Content, MeasuredBody
 from workers.scape.fit import FitResult
@@ -46,11 +47,12 @@ def write_result(
         files = {
             "mesh.ply": ply_mesh(fit.vertices, faces),
             "mesh.obj": obj_mesh(fit.vertices, faces),
-            "mesh.glb": glb_mesh(fit.vertices, faces, measured.rows),
+            "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
+            "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
             "cloud.ply": ply_cloud(cloud.points, cloud.normals),
             "measurements.json": _json(measurements_document(scan_id, measured)),
             STANDARD_POSE_FILE: _json(measurements_document(scan_id, standing)),
-            "preview.png": preview(fit.vertices, faces, measured.rows),
+            "preview.png": preview(fit.vertices, faces, measured.rows, fit.verdict),
         }
         for name, content in files.items():
             (folder / name).write_bytes(content)

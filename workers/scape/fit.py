@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -18,6 +18,7 @@ from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
+from workers.scape.intersections import untangled
 from workers.scape.joint import (
     COARSE,
     FINE,
@@ -126,6 +127,8 @@ def _fit(
         fitted = time.monotonic()
         progress("surface", 0.0)
         surface = fit_surface(model, joint.vertices, cloud)
+        free = untangled(model, surface.vertices, joint.vertices)
+        surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.render import Picture, render_mesh, write_text
+from workers.render import Picture, png, render_mesh, write_text
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
@@ -69,5 +68,4 @@ def _picture(model: BodyModel, vertices: Array, view: str, colors: Array | None 
 
 def _write(path: Path, picture: Picture) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), picture):
-        raise OSError(f"{path}: the picture cannot be written")
+    path.write_bytes(png(picture))
