@@ -13,7 +13,7 @@ from pathlib import Path
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
 from workers.export.result import write_result
-from workers.measure.body import measure_body
+from workers.measure.body import measure_body, measure_standing
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
 from workers.scape.intersections import untangled
 from workers.scape.model import BodyModel, load_model
@@ -106,7 +106,8 @@ def _finish(
     watch.seconds.update(fit.seconds)
     progress("measuring", 0.0)
     with watch.step("measure"):
-        measurements = measure_body(model, fit.vertices, fit.vertex_sigma_m)
+        measured = measure_body(model, fit.vertices, fit.vertex_sigma_m)
+        standing = measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
-    write_result(out_folder, model, fit, cloud, measurements, scan_id, method, watch)
+    write_result(out_folder, model, fit, cloud, measured, standing, scan_id, method, watch)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

@@ -14,6 +14,8 @@ from workers.scape.database import PARTS, BodyDatabase, symmetry_map
 from workers.scape.deformation import EdgeSolver, edges, vertex_areas
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, load_model, save_model
+from workers.scape.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.skin import separated
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -35,6 +37,7 @@ _VERTEX_METRIC = 0.6
 gradients alone let small errors add up along a limb."""
 _RIDGE_CANDIDATES = (1e-3, 1e-2, 1e-1, 1.0)
 _POSE_FIELD_FLOOR_M = 5e-5
+_RESIDUAL_BODIES = 60
 
 
 def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
@@ -52,6 +55,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     mean = bodies.mean(axis=0, dtype=np.float64)
     symmetry = symmetry_map(mean)
     mean = 0.5 * (mean + mean[symmetry] * (-1.0, 1.0, 1.0))
+    mean = separated(mean, database.faces, symmetry)
     ground = mean[:, 2].min()
     solver = EdgeSolver.build(mean, database.faces)
     progress("shape components", 0.2)
@@ -59,7 +63,6 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     # Where a body stands is the translation's business alone: the pelvis' centroid stays put.
     pelvis = database.part_weights[:, 0] * vertex_areas(mean, database.faces)
     directions -= np.einsum("p,jpc->jc", pelvis / pelvis.sum(), directions)[:, None]
-    joints = database.neutral_joints(shapes).mean(axis=0)
     mean = mean - (0.0, 0.0, ground)
     names = list(PARTS)
     parents = np.array([-1 if p is None else names.index(p) for p, _ in PARTS.values()], np.int32)
@@ -70,7 +73,6 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
         "part_parents": parents,
         "weight_parts": part_columns.astype(np.uint8),
         "weights": weights.astype(np.float32),
-        "joints": joints,
         "symmetry": symmetry,
         **_packed_directions(directions),
         "vertex_sigma": np.full(len(mean), 2e-3),
@@ -192,12 +194,14 @@ def _ridge(design: Array, target: NDArray[np.float32], strength: float) -> Array
 
 
 def _residual_sigma(model: BodyModel, database: BodyDatabase, plan: TrainingPlan) -> Array:
-    """Root mean square (P,) of what the model leaves out on 100 validation bodies in poses."""
-    shapes = database.sample("validation", 100, plan.seed)
-    bodies = database.vertices(shapes, database.sample_poses("validation", 100, plan.seed))
+    """Root mean square (P,) of what the model leaves out on validation bodies in poses."""
+    shapes = database.sample("validation", _RESIDUAL_BODIES, plan.seed)
+    poses = database.sample_poses("validation", _RESIDUAL_BODIES, plan.seed)
+    bodies = database.vertices(shapes, poses)
+    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     squares = np.zeros(model.vertex_count)
     for body in bodies:
-        squares += np.square(model.vertices(model.project(body)) - body).sum(axis=1)
+        squares += np.square(model.vertices(best_fit(model, samples, body)) - body).sum(axis=1)
     return np.sqrt(squares / (3 * len(bodies)))
 
 
