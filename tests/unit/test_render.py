@@ -23,7 +23,7 @@ def model() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def rows(model: BodyModel) -> list[Measurement]:
-    return measure_body(model, model.mean, np.full(model.vertex_count, 1e-3))
+    return list(measure_body(model, model.mean, np.full(model.vertex_count, 1e-3)).rows)
 
 
 @pytest.mark.parametrize(
