@@ -53,6 +53,9 @@ _LEADER: Color = (176, 172, 168)
 _WARNING: Color = (40, 60, 170)
 _FLOOR: Color = (226, 224, 222)
 _BEHIND_M = 0.012
+"""How far behind the skin a girth's line counts as hidden; it lies on the skin's far side."""
+_BENEATH_M = 0.06
+"""The same for straight distances, which run beneath the skin on the near side too."""
 _STATURE_GAP = 16
 
 
@@ -129,7 +132,8 @@ def _drawn(
     line = frame.pixels(path)
     u, v = np.rint(line).astype(int).T
     u, v = np.clip(u, 0, frame.width - 1), np.clip(v, 0, frame.height - 1)
-    hidden = frame.depths(path) > rendering.depth_m[v, u] + _BEHIND_M
+    behind = _BEHIND_M if row.closed else _BENEATH_M
+    hidden = frame.depths(path) > rendering.depth_m[v, u] + behind
     line = line + np.array([shift, 0.0])
     for start, end in _runs(hidden):
         piece = line[start : min(end + 1, len(line))]
