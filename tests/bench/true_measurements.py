@@ -58,7 +58,7 @@ class TrueBody:
         if isinstance(way, Top):
             return float(self._v[self._part == way.part, 2].max())
         if isinstance(way, Drop):
-            return float(self._at[way.upper][2] - self._at[way.lower][2])
+            return max(0.0, float(self._at[way.upper][2] - self._at[way.lower][2]))
         if isinstance(way, Route):
             return self._route(way)
         return self._section(row, way)

@@ -106,7 +106,7 @@ class _Tracer:
                 top = int(index[np.argmax(self._vertices[index, 2])])
                 return float(self._vertices[top, 2]), EdgePoints.at([top]), False, True
             case Drop(upper, lower):
-                drop = float(self._at(upper)[2] - self._at(lower)[2])
+                drop = max(0.0, float(self._at(upper)[2] - self._at(lower)[2]))
                 ends = EdgePoints.at([self._model.landmarks[upper], self._model.landmarks[lower]])
                 return drop, ends, False, False
 
