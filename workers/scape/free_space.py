@@ -72,9 +72,14 @@ class FreeSpace:
 
 def _view(view: CameraView) -> _View:
     inside = cv2.distanceTransform(view.background.astype(np.uint8), cv2.DIST_L2, 3)
-    slope = tuple(cv2.Sobel(inside, cv2.CV_32F, *order, ksize=3, scale=0.125)
-                  for order in ((1, 0), (0, 1)))  # fmt: skip
-    return _View(view, invert(view.calibration.world_from_camera), inside, (slope[0], slope[1]))
+    slope_u = cv2.Sobel(inside, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    slope_v = cv2.Sobel(inside, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    return _View(
+        view,
+        invert(view.calibration.world_from_camera),
+        inside.astype(np.float32, copy=False),
+        (slope_u.astype(np.float32, copy=False), slope_v.astype(np.float32, copy=False)),
+    )
 
 
 def _intrusions(view: _View, vertices: Array) -> Intrusions:

@@ -10,6 +10,7 @@ is smooth and fades over what no camera saw. Conjugate gradients from the last r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,12 +26,12 @@ Array = NDArray[np.float64]
 
 _ROUNDS = (
     # gate, angle, stiffness
-    (0.030, np.radians(50), 30.0),
-    (0.020, np.radians(45), 6.0),
-    (0.012, np.radians(40), 1.5),
+    (0.030, np.radians(50), 240.0),
+    (0.020, np.radians(45), 48.0),
+    (0.012, np.radians(40), 12.0),
 )
 _SIGMA_OF_STIFFNESS_M = 0.001
-_FADE = 2e-4
+_FADE = 2.5e-5
 """A weak pull towards the model, so that a field cannot drift where there are no data."""
 _INDEPENDENT = 0.25
 """Share of a vertex' readings that count as independent: matching windows overlap."""
@@ -58,7 +59,7 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
     points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
-    laplacian = model.solver.laplacian
+    laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
     weight = np.zeros(len(vertices))
@@ -81,6 +82,16 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     return SurfaceFit(
         current, _posterior_sigma(model, weight), seen, np.where(weight > 0, residual, np.nan)
     )
+
+
+@lru_cache(maxsize=2)
+def _membrane(model: BodyModel) -> sp.csr_matrix:
+    """L (P, P), the graph's: in two dimensions a membrane is as stiff in small triangles as in
+    large ones, so that ears and lips do not follow noise."""
+    pattern = abs(model.solver.laplacian).sign()
+    pattern = pattern - sp.diags(pattern.diagonal())
+    degree = np.asarray(pattern.sum(axis=1)).ravel()
+    return (sp.diags(degree) - pattern).tocsr()
 
 
 def _gathered(
