@@ -19,7 +19,9 @@ UP = np.array([0.0, 0.0, 1.0])
 def test_a_spheres_girth() -> None:
     center = np.array([0.1, 0.2, 1.0])
     ball = sphere(tuple(center), 0.1)
-    found, piece = EdgeNet.build(ball.faces).cut(ball.vertices, center, TILTED)
+    net = EdgeNet.build(ball.faces)
+    found, crossing = net.cut(ball.vertices, center, TILTED)
+    piece = net.pieces(crossing)
     points = found.on(ball.vertices)
     assert np.abs((points - center) @ TILTED).max() < 1e-12
     assert len(np.unique(piece)) == 1
@@ -32,7 +34,9 @@ def test_two_legs_are_two_pieces() -> None:
     left, right = sphere((-0.1, 0.0, 0.0), 0.099), sphere((0.1, 0.0, 0.0), 0.099)
     vertices = np.concatenate([left.vertices, right.vertices])
     faces = np.concatenate([left.faces, right.faces + len(left.vertices)]).astype(np.int32)
-    found, piece = EdgeNet.build(faces).cut(vertices, np.zeros(3), UP)
+    net = EdgeNet.build(faces)
+    found, crossing = net.cut(vertices, np.zeros(3), UP)
+    piece = net.pieces(crossing)
     x = found.on(vertices)[:, 0]
     assert len(np.unique(piece)) == 2
     assert len(np.unique(piece[x < 0])) == len(np.unique(piece[x > 0])) == 1

@@ -74,16 +74,19 @@ class EdgeNet:
         return cls(pairs[:, 0].astype(np.intp), pairs[:, 1].astype(np.intp), left, right)
 
     def cut(self, vertices: Array, point: Array, normal: Array) -> tuple[EdgePoints, Index]:
-        """Where a plane cuts the edges, and which connected piece each point belongs to."""
-        away = (vertices - point) @ normal
+        """Where a plane cuts the edges: the points, and which edge each lies on."""
+        away = vertices @ normal - point @ normal
         from_m, to_m = away[self.tails], away[self.heads]
         crossing = np.flatnonzero((from_m < 0.0) != (to_m < 0.0))
         from_m, to_m = from_m[crossing], to_m[crossing]
         found = EdgePoints(self.tails[crossing], self.heads[crossing], from_m / (from_m - to_m))
-        return found, self._pieces(crossing)
+        return found, crossing
 
-    def _pieces(self, crossing: Index) -> Index:
-        """A cut triangle has two cut edges: it joins them."""
+    def pieces(self, crossing: Index) -> Index:
+        """Which connected piece of a section each cut edge belongs to.
+
+        A cut triangle has two cut edges: it joins them.
+        """
         count = len(crossing)
         triangle = np.concatenate([self.left[crossing], self.right[crossing]])
         cut_edge = np.tile(np.arange(count), 2)

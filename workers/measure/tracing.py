@@ -139,9 +139,11 @@ class _Tracer:
         key = Section(section.plane, section.parts, section.whole)
         if key not in self._cuts:
             point, normal = self._plane(section.plane)
-            found, piece = _net(self._model, section.parts).cut(self._vertices, point, normal)
+            net = _net(self._model, section.parts)
+            found, crossing = net.cut(self._vertices, point, normal)
             places = found.on(self._vertices)
             if not section.whole and len(places):
+                piece = net.pieces(crossing)
                 nearest = np.argmin(np.linalg.norm(places - point, axis=1))
                 chosen = np.flatnonzero(piece == piece[nearest])
                 found, places = found.take(chosen), places[chosen]
