@@ -18,6 +18,7 @@ from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
+from workers.scape.intersections import untangled
 from workers.scape.joint import (
     COARSE,
     FINE,
@@ -129,6 +130,8 @@ def _fit(
         progress("surface", 0.0)
         cloud = replace(cloud, points=cameras.moved(cloud.points, cloud.camera))
         surface = fit_surface(model, joint.vertices, cloud)
+        free = untangled(model, surface.vertices, joint.vertices)
+        surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
