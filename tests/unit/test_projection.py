@@ -65,7 +65,7 @@ def test_derivatives_of_some_components_are_those_of_all(model: BodyModel) -> No
 
 
 def test_a_surface_in_another_topology_is_found(model: BodyModel) -> None:
-    """A held-out body whose vertices come in no order that the model knows, some of them missing."""
+    """A held-out body whose vertices come in no order that the model knows."""
     body = np.load(BODIES / "ben.npz")
     vertices, faces = body["vertices"].astype(np.float64), body["faces"].astype(np.int32)
     order = np.random.default_rng(0).permutation(len(vertices))

@@ -1,8 +1,9 @@
 import numpy as np
 
+from workers.scape.crossings import crossing_pairs
 from workers.scape.deformation import signed_volume
 from workers.scape.model import load_model
-from workers.scape.skin import crossing_triangles, outer_skin, separated
+from workers.scape.skin import outer_skin, separated
 
 
 def _turned(profile: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:
@@ -58,9 +59,9 @@ def test_what_runs_through_itself_is_drawn_apart() -> None:
     both = np.concatenate([toe - (0.009875, 0.0, 0.0), toe * (-1, 1, 1) + (0.009875, 0.0, 0.0)])
     both_faces = np.concatenate([faces, faces[:, ::-1] + len(toe)])
     mirror = np.roll(np.arange(2 * len(toe)), len(toe)).astype(np.int32)
-    assert len(crossing_triangles(both, both_faces))
+    assert len(crossing_pairs(both, both_faces))
     apart = separated(both, both_faces, mirror)
-    assert not len(crossing_triangles(apart, both_faces))
+    assert not len(crossing_pairs(apart, both_faces))
     assert np.abs(apart - both).max() < 6e-4
     assert np.allclose(apart[mirror] * (-1, 1, 1), apart)
 
@@ -71,7 +72,7 @@ def test_the_template_is_one_closed_skin() -> None:
     edges = 3 * len(model.faces) // 2
     assert model.vertex_count - edges + len(model.faces) == 2
     assert 0.04 < signed_volume(model.mean, model.faces) < 0.15
-    assert not len(crossing_triangles(model.mean, model.faces))
+    assert not len(crossing_pairs(model.mean, model.faces))
     assert np.array_equal(model.symmetry[model.symmetry], np.arange(model.vertex_count))
     mirrored = model.mean[model.symmetry] * (-1.0, 1.0, 1.0)
     assert np.abs(mirrored - model.mean).max() < 1e-4

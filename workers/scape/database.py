@@ -196,6 +196,7 @@ class BodyDatabase:
         body = self.vertices(self._ordinary())[0]
         kept, self.faces = outer_skin(body, closed, symmetry_map(body))
         self._skin = self._skin[kept]
+        self.symmetry = symmetry_map(body[kept])
 
     def _ordinary(self) -> Shapes:
         """The body in the middle of every scale."""
@@ -261,7 +262,7 @@ class BodyDatabase:
         """
         rng = np.random.default_rng((seed, _SPLIT_SEEDS[split]))
         candidates = self._candidates(rng, _CANDIDATES * count)
-        stature, mass_index = self._sizes(candidates)
+        stature, mass_index = self.sizes(candidates)
         female = candidates.phenotypes["gender"] > 0.5
         chosen = np.empty(count, np.intp)
         scale = np.empty(count)
@@ -281,7 +282,7 @@ class BodyDatabase:
         taken = candidates.take(chosen)
         return Shapes(taken.phenotypes, taken.local_changes, scale)
 
-    def _sizes(self, shapes: Shapes) -> tuple[Array, Array]:
+    def sizes(self, shapes: Shapes) -> tuple[Array, Array]:
         """Statures (n,) in metres and body mass indices (n,) in kg/m^2."""
         sizes = []
         for start in range(0, len(shapes), 256):

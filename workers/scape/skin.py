@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from workers.scape.crossings import crossing_pairs
 from workers.scape.deformation import Array, Faces, vertex_normals
 
 _DIRECTIONS = 400
@@ -60,7 +61,7 @@ def separated(vertices: Array, faces: Faces, mirror: NDArray[np.int32]) -> Array
     """
     apart = vertices.copy()
     for _ in range(_MOST_STEPS):
-        pairs = crossing_triangles(apart, faces)
+        pairs = crossing_pairs(apart, faces)
         if not len(pairs):
             break
         moved = np.zeros(len(apart), bool)
@@ -68,14 +69,6 @@ def separated(vertices: Array, faces: Faces, mirror: NDArray[np.int32]) -> Array
         moved |= moved[mirror]
         apart[moved] -= _STEP_M * vertex_normals(apart, faces)[moved]
     return apart
-
-
-def crossing_triangles(vertices: Array, faces: Faces) -> NDArray[np.int32]:
-    """Pairs (n, 2) of triangles that run through each other."""
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
-    )
-    return np.asarray(mesh.get_self_intersecting_triangles(), np.int32).reshape(-1, 2)
 
 
 def _openness(vertices: Array, faces: Faces) -> Array:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.database import PARTS, BodyDatabase, symmetry_map
+from workers.scape.database import PARTS, BodyDatabase
 from workers.scape.deformation import EdgeSolver, edges, vertex_areas
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, load_model, save_model
@@ -29,6 +29,8 @@ class TrainingPlan:
     poses: int = 1500
     components: int = 160
     seed: int = 0
+    residual_bodies: int = 60
+    """Validation bodies from which the residual's noise is estimated."""
 
 
 _WEIGHTS_KEPT = 6
@@ -37,7 +39,6 @@ _VERTEX_METRIC = 0.6
 gradients alone let small errors add up along a limb."""
 _RIDGE_CANDIDATES = (1e-3, 1e-2, 1e-1, 1.0)
 _POSE_FIELD_FLOOR_M = 5e-5
-_RESIDUAL_BODIES = 60
 
 
 def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
@@ -53,7 +54,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     bodies = database.vertices(shapes).astype(np.float32)
     bodies -= bodies.mean(axis=1, keepdims=True)
     mean = bodies.mean(axis=0, dtype=np.float64)
-    symmetry = symmetry_map(mean)
+    symmetry = database.symmetry
     mean = 0.5 * (mean + mean[symmetry] * (-1.0, 1.0, 1.0))
     mean = separated(mean, database.faces, symmetry)
     ground = mean[:, 2].min()
@@ -195,8 +196,8 @@ def _ridge(design: Array, target: NDArray[np.float32], strength: float) -> Array
 
 def _residual_sigma(model: BodyModel, database: BodyDatabase, plan: TrainingPlan) -> Array:
     """Root mean square (P,) of what the model leaves out on validation bodies in poses."""
-    shapes = database.sample("validation", _RESIDUAL_BODIES, plan.seed)
-    poses = database.sample_poses("validation", _RESIDUAL_BODIES, plan.seed)
+    shapes = database.sample("validation", plan.residual_bodies, plan.seed)
+    poses = database.sample_poses("validation", plan.residual_bodies, plan.seed)
     bodies = database.vertices(shapes, poses)
     samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     squares = np.zeros(model.vertex_count)
