@@ -93,8 +93,8 @@ def _head_and_neck(t: _Template) -> dict[str, int]:
     ]
     deepest = v[throat, 1].max()
     pit = t.extreme(throat[v[throat, 1] > deepest - 0.003], _DOWN)
-    # Below the larynx, square to the neck, which leans forwards by about 19 degrees.
-    neck_front = t.nearest(throat, (0.0, v[pit, 1], 0.45 * v[pit, 2] + 0.55 * v[chin, 2]))
+    # Below the larynx, where the neck is narrowest; square to it: it leans forwards by 19 degrees.
+    neck_front = t.nearest(throat, (0.0, v[pit, 1], 0.32 * v[pit, 2] + 0.68 * v[chin, 2]))
     across = v[cervicale, 1] - v[neck_front, 1]
     neck_back = t.nearest(
         back, (0.0, v[cervicale, 1], v[neck_front, 2] + np.tan(np.radians(19.0)) * across)
