@@ -5,13 +5,14 @@ BIN := $(VENV)/bin
 DEMO := demo
 BENCHES := bench-capture bench-fit bench-measure
 
-.PHONY: help demo test check format train intervals clean $(BENCHES)
+.PHONY: help demo test check format train evaluate-model intervals clean $(BENCHES)
 
 help:
 	@echo "make demo     a booth of four replayed Kinects: calibrate, scan, print the result"
 	@echo "make test     all tests"
 	@echo "make check    lint, formatting and types"
-	@echo "make train    learn the body model anew (30 minutes)"
+	@echo "make train    learn the body model anew (minutes)"
+	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
 	@echo "make intervals  calibrate the measurements' intervals anew, after any change to model or fit"
 	@echo "make $(BENCHES)   tables of speed and accuracy"
 
@@ -32,6 +33,9 @@ format: $(VENV)/dev.stamp
 
 train: $(VENV)/train.stamp
 	$(BIN)/reconstruct train --out workers/scape/data/body.npz
+
+evaluate-model: $(VENV)/train.stamp
+	$(BIN)/reconstruct evaluate-model $(ARGS)
 
 intervals: $(VENV)/train.stamp
 	$(BIN)/python tests/bench/bench_measure.py --calibrate 96 $(ARGS)

@@ -49,8 +49,10 @@ def evaluate(plan: Evaluation) -> Iterator[str]:
     shapes = database.sample("test", plan.bodies, plan.seed)
     neutral = database.vertices(shapes)
     posed = database.vertices(shapes, database.sample_poses("test", plan.bodies, plan.seed))
-    yield f"model {model.name} {model.sha256[:12]}: {model.vertex_count} vertices, "
-    yield f"{model.part_count} parts, {model.beta_count} components"
+    yield (
+        f"model {model.name} {model.sha256[:12]}: {model.vertex_count} vertices, "
+        f"{model.part_count} parts, {model.beta_count} components"
+    )
     yield f"{plan.bodies} held-out bodies, split test, seed {plan.seed}; distances in mm"
     yield ""
     everyone = database.sample("train", _POPULATION, plan.seed)
