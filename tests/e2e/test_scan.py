@@ -31,14 +31,11 @@ needs_replay = pytest.mark.skipif(
 
 
 def _surface_rms_m(result: Path, body: str) -> float:
-    found = np.asarray(o3d.io.read_triangle_mesh(str(result / "mesh.ply")).vertices)
-    truth = np.load(BODIES / f"{body}.npz")
+    mesh = o3d.io.read_triangle_mesh(str(result / "mesh.ply"))
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(truth["vertices"].astype(np.float32)),
-        o3d.core.Tensor(truth["faces"].astype(np.uint32)),
-    )
-    distance = scene.compute_distance(o3d.core.Tensor(found.astype(np.float32))).numpy()
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    truth = np.load(BODIES / f"{body}.npz")["vertices"].astype(np.float32)
+    distance = scene.compute_distance(o3d.core.Tensor(truth)).numpy()
     return float(np.sqrt(np.mean(distance**2)))
 
 
