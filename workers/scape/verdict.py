@@ -141,6 +141,7 @@ def judge(
     for camera, shift in camera_shifts_m.items():
         if shift > _CAMERA_SHIFT_M:
             reasons.append(
-                f"camera {camera} looks {1e3 * shift:.0f} mm or more off its calibration; run station check"
+                f"camera {camera} looks {1e3 * shift:.0f} mm or more off its calibration; "
+                "run station check"
             )
     return Verdict("rescan" if reasons else "ok", tuple(reasons))
