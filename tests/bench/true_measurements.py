@@ -95,7 +95,11 @@ class TrueBody:
             return start, np.array([0.0, 0.0, 1.0])
         if isinstance(plane, Square):
             line = at[plane.end] - at[plane.start]
-            through = at[plane.at] if plane.at else at[plane.start] + plane.share * line
+            share = plane.share
+            if plane.beyond:
+                passed = (at[plane.beyond] - at[plane.start]) @ line / (line @ line)
+                share = max(share, passed + 0.02 / np.sqrt(line @ line))
+            through = at[plane.at] if plane.at else at[plane.start] + share * line
             return through, line / np.sqrt(line @ line)
         normal = np.cross(at[plane.back] - at[plane.front], at[plane.other_side] - at[plane.side])
         return at[plane.front], normal / np.sqrt(normal @ normal)

@@ -36,12 +36,17 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A plane square to the line between two landmarks: through `at`, or at a share of the line."""
+    """A plane square to the line between two landmarks: through `at`, or at a share of the line.
+
+    A share's plane lies at least 2 cm farther along than the landmark `beyond`: no tape goes round
+    an arm above the armpit, however low that is.
+    """
 
     start: str
     end: str
     share: float = 0.0
     at: str | None = None
+    beyond: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,8 +264,10 @@ def _arm(side: str) -> tuple[Definition, ...]:
     lower = (f"forearm_{side}", f"hand_{side}", f"upper_arm_{side}")
     return (
         Definition(
-            f"upper_arm_girth_{side}", "midway from shoulder point to elbow", "girth",
-            Section(Square(acromion, elbow, 0.5), upper), f"{_CLOTHES} 5.3.16",
+            f"upper_arm_girth_{side}",
+            "midway from shoulder point to elbow, at least 2 cm below the armpit", "girth",
+            Section(Square(acromion, elbow, 0.5, beyond=f"armpit_{side}"), upper),
+            f"{_CLOTHES} 5.3.16",
         ),
         Definition(
             f"elbow_girth_{side}", "at the elbow, square to the line shoulder to wrist", "girth",

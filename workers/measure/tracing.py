@@ -34,6 +34,8 @@ from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
+_CLEARANCE_M = 0.02
+"""How far `Square.beyond` keeps a plane from a landmark."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +126,15 @@ class _Tracer:
                 if towards:
                     point = point + share * (self._mean(towards) - point)
                 return point, _UP
-            case Square(start, end, share, at):
+            case Square(start, end, share, at, beyond):
                 line = self._at(end) - self._at(start)
-                point = self._at(start) + share * line if at is None else self._at(at)
-                return point, line / np.linalg.norm(line)
+                length = float(np.linalg.norm(line))
+                along = share * length
+                if beyond is not None:
+                    passed = (self._at(beyond) - self._at(start)) @ line / length
+                    along = max(along, float(passed) + _CLEARANCE_M)
+                point = self._at(start) + along / length * line if at is None else self._at(at)
+                return point, line / length
             case Tilted(front, back, side, other):
                 normal = np.cross(
                     self._at(other) - self._at(side), self._at(back) - self._at(front)
