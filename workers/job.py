@@ -45,6 +45,7 @@ def warm_up() -> BodyModel:
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
     compile_average()
+    measure_body(model, model.mean)
     return model
 
 
