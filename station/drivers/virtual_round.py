@@ -45,6 +45,8 @@ def overlay(
     ``still`` is the whole view without them. Their shadows in the projector's light fall on what
     stands still and on one another.
     """
+    if not capsules:
+        return None
     camera_from_world = invert(camera.world_from_camera)
     shapes = np.array(
         [
