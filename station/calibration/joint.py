@@ -224,7 +224,8 @@ def solve_joint(problem: Problem, start: State) -> State:
     for _ in range(_ITERATIONS):
         equations = _Equations(problem, layout, state)
         step, path_step = equations.solve()
-        state = _moved(problem, layout, state, step, path_step)
+        state = moved_state(problem, layout, state, step)
+        state = replace(state, controls=state.controls + path_step)
         if max(np.abs(step).max(), np.abs(path_step).max()) < _SMALL_STEP:
             break
     equations = _Equations(problem, layout, state)
@@ -419,7 +420,8 @@ def _rays(camera: CameraCalibration, patches: Array) -> Array:
     return np.asarray(undone.reshape((*patches.shape[:-1], 2)), np.float64)
 
 
-def _moved(problem: Problem, layout: Layout, state: State, step: Array, path: Array) -> State:
+def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> State:
+    """The state after a step of the border's unknowns."""
     poses, clocks, corrections = {}, {}, {}
     for name in problem.cameras:
         index = layout.camera(name)
@@ -432,7 +434,6 @@ def _moved(problem: Problem, layout: Layout, state: State, step: Array, path: Ar
         poses=poses,
         clock_s=clocks,
         corrections=corrections,
-        controls=state.controls + path,
         places={name: at + step[layout.triple(name)] for name, at in state.places.items()},
         planes={name: q + step[layout.triple(name)] for name, q in state.planes.items()},
     )

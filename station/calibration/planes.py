@@ -24,11 +24,12 @@ _TRIALS = 300
 _TILT_COSINE = 0.6
 """A floor or a wall is at most 53 degrees off what an upright camera would see."""
 _HEIGHT_M = (0.15, 3.5)
-_INCIDENCE_COSINE = 0.42
+_INCIDENCE_COSINE = 0.26
+"""75 degrees: a camera at hip height sees the floor at a slant, if at all."""
 _UNEVEN_M = 5e-4
 """How flat floors and boards are over a cell."""
 _LEAST_PATCHES = 40
-_LEAST_SHARE = 0.5
+_LEAST_SHARE = 0.3
 _FOREGROUND = 0.015
 
 

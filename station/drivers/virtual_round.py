@@ -58,11 +58,12 @@ def overlay(
             for capsule in capsules
         ]
     )
-    K = camera.K
-    window = _window(shapes, camera)
-    if window is None:
+    bounds = _bounds(shapes, camera)
+    inside = (bounds[:, 2:] - bounds[:, :2]).min(axis=1) > 0
+    if not inside.any():
         return None
-    top, bottom, left, right = window
+    shapes, bounds = shapes[inside], bounds[inside]
+    (left, top), (right, bottom) = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
     part = np.s_[top:bottom, left:right]
     view = TrueView(
         still.depth_m[part].copy(),
@@ -70,33 +71,32 @@ def overlay(
         still.lit[part].copy(),
         still.reflects[part].copy(),
     )
-    _draw(
-        shapes, K[0, 0], K[1, 1], K[0, 2] - left, K[1, 2] - top, BASELINE_M,
-        view.depth_m, view.incidence_rad, view.lit, view.reflects,
-    )  # fmt: skip
-    return view, Window(top, left, *still.depth_m.shape)
-
-
-def _window(shapes: Array, camera: CameraCalibration) -> tuple[int, int, int, int] | None:
     K = camera.K
-    ends = np.concatenate([shapes[:, :3], shapes[:, 3:6]])
-    radii = np.tile(shapes[:, 6], 2)
-    near = np.maximum(ends[:, 2] - radii, 0.2)
-    u = K[0, 0] * ends[:, 0] / np.maximum(ends[:, 2], 0.2) + K[0, 2]
-    v = K[1, 1] * ends[:, 1] / np.maximum(ends[:, 2], 0.2) + K[1, 2]
-    reach = 1.1 * K[0, 0] * radii / near + _MARGIN_PX
-    # The projector stands to the camera's right, so shadows fall to the left of what casts them.
-    shadow = K[0, 0] * BASELINE_M / near
-    seen = ends[:, 2] > 0.3
-    if not seen.any():
-        return None
-    left = max(int((u - reach - shadow)[seen].min()), 0)
-    right = min(int((u + reach)[seen].max()) + 1, camera.width)
-    top = max(int((v - reach)[seen].min()), 0)
-    bottom = min(int((v + reach)[seen].max()) + 1, camera.height)
-    if right - left < 4 or bottom - top < 4:
-        return None
-    return top, bottom, left, right
+    _draw(
+        shapes, bounds - (left, top, left, top), K[0, 0], K[1, 1], K[0, 2] - left, K[1, 2] - top,
+        BASELINE_M, view.depth_m, view.incidence_rad, view.lit, view.reflects,
+    )  # fmt: skip
+    return view, Window(int(top), int(left), *still.depth_m.shape)
+
+
+def _bounds(shapes: Array, camera: CameraCalibration) -> NDArray[np.int64]:
+    """(n, 4) left, top, right, bottom of each capsule and its shadow; empty where out of sight."""
+    K = camera.K
+    sides = []
+    for end in (shapes[:, :3], shapes[:, 3:6]):
+        depth = np.maximum(end[:, 2], 0.3)
+        u, v = K[0, 0] * end[:, 0] / depth + K[0, 2], K[1, 1] * end[:, 1] / depth + K[1, 2]
+        near = np.maximum(depth - shapes[:, 6], 0.2)
+        reach = 1.1 * K[0, 0] * shapes[:, 6] / near + _MARGIN_PX
+        # The projector stands to the camera's right, so shadows fall to the left of what casts them.
+        shadow = K[0, 0] * BASELINE_M / near
+        sides.append(np.stack([u - reach - shadow, v - reach, u + reach, v + reach], axis=1))
+    low = np.minimum(sides[0], sides[1])[:, :2]
+    high = np.maximum(sides[0], sides[1])[:, 2:]
+    size = (camera.width, camera.height)
+    found = np.concatenate([np.clip(low, 0, size), np.clip(high + 1, 0, size)], axis=1)
+    found[np.maximum(shapes[:, 2], shapes[:, 5]) < 0.3] = 0
+    return found.astype(np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -141,32 +141,27 @@ def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # prag
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(shapes, fx, fy, cx, cy, baseline, depth, incidence, lit, reflects):  # type: ignore[no-untyped-def]  # pragma: no cover
-    height, width = depth.shape
-    for v in range(height):
-        y = (v - cy) / fy
-        for u in range(width):
-            x = (u - cx) / fx
-            nearest = depth[v, u] if depth[v, u] > 0.0 else np.inf
-            drawn = False
-            for i in range(len(shapes)):
+def _draw(shapes, bounds, fx, fy, cx, cy, baseline, depth, incidence, lit, reflects):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(len(shapes)):
+        for v in range(bounds[i, 1], bounds[i, 3]):
+            y = (v - cy) / fy
+            for u in range(bounds[i, 0], bounds[i, 2]):
+                x = (u - cx) / fx
                 t, nx, ny, nz = _hit(shapes[i], 0.0, 0.0, 0.0, x, y, 1.0)
-                if t < nearest:
-                    nearest = t
-                    drawn = True
+                if t < np.inf and (depth[v, u] == 0.0 or t < depth[v, u]):
                     cosine = abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0)
+                    depth[v, u] = t
                     incidence[v, u] = np.arccos(min(cosine, 1.0))
-            if drawn:
-                depth[v, u] = nearest
-                lit[v, u] = True
-                reflects[v, u] = True
-            if not lit[v, u] or not np.isfinite(nearest):
-                continue
-            px, py, pz = x * nearest, y * nearest, nearest
-            tx, ty, tz = px - baseline, py, pz
-            reach = 1.0 - _SHADOW_TOLERANCE_M / np.sqrt(tx * tx + ty * ty + tz * tz)
-            for i in range(len(shapes)):
-                t, _, _, _ = _hit(shapes[i], baseline, 0.0, 0.0, tx, ty, tz)
-                if t < reach:
+                    lit[v, u] = True
+                    reflects[v, u] = True
+    for i in range(len(shapes)):
+        for v in range(bounds[i, 1], bounds[i, 3]):
+            y = (v - cy) / fy
+            for u in range(bounds[i, 0], bounds[i, 2]):
+                z = depth[v, u]
+                if not lit[v, u] or z == 0.0:
+                    continue
+                tx, ty, tz = (u - cx) / fx * z - baseline, y * z, z
+                reach = 1.0 - _SHADOW_TOLERANCE_M / np.sqrt(tx * tx + ty * ty + tz * tz)
+                if _hit(shapes[i], baseline, 0.0, 0.0, tx, ty, tz)[0] < reach:
                     lit[v, u] = False
-                    break
