@@ -25,16 +25,23 @@ TOLERANCE = np.array([5e-3, 3e-4, 1.5e-3, 2e-3, 2e-3])
 """Standard deviations among sensors as they leave the factory."""
 
 
-def design(camera: CameraCalibration, patches: Array) -> Array:
-    """(..., 5): change of each patch's inverse depth by the parameters; patches (..., >= 3)."""
-    u, v, w = patches[..., 0], patches[..., 1], patches[..., 2]
+def image_place(camera: CameraCalibration, pixels: Array) -> Array:
+    """(..., 2): x, y from -1 to 1 over the image of pixels (..., 2)."""
+    return np.asarray(2.0 * pixels / (camera.width - 1, camera.height - 1) - 1.0)
+
+
+def design(inverse: Array, place: Array) -> Array:
+    """(..., 5): change of inverse depths (...) by the parameters, at places (..., 2) in the image.
+
+    To be taken at expected inverse depths: noise that is in both sides of an equation biases it.
+    """
     return np.stack(
         [
-            np.ones_like(w),
-            w,
-            (w - MIDDLE) ** 2,
-            2.0 * u / (camera.width - 1) - 1.0,
-            2.0 * v / (camera.height - 1) - 1.0,
+            np.ones_like(inverse),
+            inverse,
+            (inverse - MIDDLE) ** 2,
+            place[..., 0],
+            place[..., 1],
         ],
         axis=-1,
     )

@@ -23,6 +23,9 @@ _RADIUS_SLACK = 0.03
 _RADIUS_SIGMAS = 4.0
 _LEAST_AT_REST = 5
 _REST_GATE_M = 0.02
+_SAME_COSINE = np.cos(np.radians(4.0))
+_SAME_DISTANCE_M = 0.08
+"""Within which planes may be one, before depth errors are corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,21 +100,39 @@ def named_surfaces(
     cameras: Mapping[str, CameraCalibration],
     poses: Mapping[str, Array],
 ) -> list[Surface]:
-    """Each view of a surface under the name of the side that it sees: a board has two."""
+    """Each view of a surface under the name of the side that it sees: a board has two.
+
+    Views that do not agree with the largest number of others are of something else.
+    """
     found: list[Surface] = []
-    sides: dict[str, list[tuple[str, Array]]] = {}
-    for seen in planes:
-        if seen.camera not in poses:
-            continue
-        m = Surface.of(cameras[seen.camera], seen, seen.surface).plane
-        facing = poses[seen.camera][:3, :3] @ m
-        known = sides.setdefault(seen.surface, [])
-        name = next((name for name, other in known if other @ facing > 0), None)
-        if name is None:
-            name = FLOOR if seen.surface == FLOOR else f"{seen.surface} from {seen.camera}"
-            known.append((name, facing))
-        found.append(Surface.of(cameras[seen.camera], seen, name))
+    for surface in dict.fromkeys(seen.surface for seen in planes):
+        views = [
+            (seen, _in_reference(Surface.of(cameras[seen.camera], seen, surface), poses))
+            for seen in planes
+            if seen.surface == surface and seen.camera in poses
+        ]
+        while views:
+            groups = [[other for other in views if _one_plane(view[1], other[1])] for view in views]
+            largest = max(groups, key=lambda group: sum(seen.points for seen, _ in group))
+            side = FLOOR if surface == FLOOR else f"{surface} from {largest[0][0].camera}"
+            found += [Surface.of(cameras[seen.camera], seen, side) for seen, _ in largest]
+            if surface == FLOOR:
+                break
+            views = [view for view in views if all(view is not member for member in largest)]
     return found
+
+
+def _in_reference(surface: Surface, poses: Mapping[str, Array]) -> Array:
+    """q (3,) of q . X = 1 in the reference frame."""
+    pose = poses[surface.camera]
+    facing = pose[:3, :3] @ surface.plane
+    return np.asarray(facing / (1.0 + facing @ pose[:3, 3]))
+
+
+def _one_plane(q: Array, other: Array) -> bool:
+    lengths = np.linalg.norm(q), np.linalg.norm(other)
+    turned = q @ other < _SAME_COSINE * lengths[0] * lengths[1]
+    return not turned and abs(1.0 / lengths[0] - 1.0 / lengths[1]) < _SAME_DISTANCE_M
 
 
 def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
@@ -132,9 +153,7 @@ def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
     planes: dict[str, Array] = {}
     for surface in problem.surfaces:
         if surface.surface not in planes:
-            pose = poses[surface.camera]
-            facing = pose[:3, :3] @ surface.plane
-            planes[surface.surface] = facing / (1.0 + facing @ pose[:3, 3])
+            planes[surface.surface] = _in_reference(surface, poses)
     return State(
         poses=dict(poses),
         clock_s=dict.fromkeys(problem.cameras, 0.0),

@@ -31,6 +31,8 @@ CLOCK_TOLERANCE_S = 0.005
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
+_MEDIAN = 2.366
+"""Of the squared deviation of three numbers."""
 _FOOT = 7
 """Of a camera's unknowns, pose (6) and clock (1) come before the depth correction."""
 _CAMERA = _FOOT + depth_correction.PARAMETERS
@@ -51,8 +53,8 @@ class Sightings:
     """(n, k)"""
     weight: Array
     """(n, k): 1 / variance."""
-    design: Array
-    """(n, k, 5): change by the depth correction's parameters."""
+    place: Array
+    """(n, k, 2): x, y in the image, from -1 to 1."""
 
     @classmethod
     def of(cls, camera: CameraCalibration, detections: Sequence[BallDetection]) -> Sightings:
@@ -68,14 +70,14 @@ class Sightings:
             ray=_rays(camera, patches),
             inverse=patches[..., 2],
             weight=1.0 / patches[..., 3],
-            design=depth_correction.design(camera, patches),
+            place=depth_correction.image_place(camera, patches[..., :2]),
         )
 
     def take(self, chosen: NDArray[np.bool_]) -> Sightings:
         """Some of them."""
         return Sightings(
             self.camera, self.times_s[chosen], self.centers[chosen], self.ray[chosen],
-            self.inverse[chosen], self.weight[chosen], self.design[chosen],
+            self.inverse[chosen], self.weight[chosen], self.place[chosen],
         )  # fmt: skip
 
 
@@ -94,7 +96,10 @@ class Surface:
     def of(cls, camera: CameraCalibration, seen: PlaneObservation, name: str) -> Surface:
         patches = seen.patches
         ray = np.concatenate([_rays(camera, patches), np.ones((len(patches), 1))], axis=1)
-        rows = np.concatenate([-ray, depth_correction.design(camera, patches)], axis=1)
+        weight = 1.0 / patches[:, 3]
+        m = np.linalg.solve(ray.T @ (ray * weight[:, None]), ray.T @ (weight * patches[:, 2]))
+        place = depth_correction.image_place(camera, patches[:, :2])
+        rows = np.concatenate([-ray, depth_correction.design(ray @ m, place)], axis=1)
         weighted = rows / patches[:, 3:]
         return cls(camera.name, name, weighted.T @ rows, weighted.T @ patches[:, 2])
 
@@ -208,8 +213,10 @@ def local_equations(
 ) -> tuple[Array, Array]:
     """J'WJ (n, 8, 8) and J'Wr (n, 8) of (centre, depth correction) of each detection."""
     w, gradient = ball_inverse_depth(centers, seen.ray, radius_m)
-    residual = seen.inverse + seen.design @ correction - w
-    rows = np.concatenate([-gradient, seen.design], axis=-1)
+    measured = w - depth_correction.design(w, seen.place) @ correction
+    design = depth_correction.design(measured, seen.place)
+    residual = seen.inverse + design @ correction - w
+    rows = np.concatenate([-gradient, design], axis=-1)
     weighted = rows * seen.weight[..., None]
     return (
         np.swapaxes(weighted, 1, 2) @ rows,
@@ -404,6 +411,12 @@ def _deviation(normal: Array, pull: Array) -> Array:
 
 
 def _robust_weight(deviation: Array) -> Array:
+    """Weights (n,) that leave out what deviates far more than most do.
+
+    As long as depth errors are not yet corrected all deviate, and none may be left out for that.
+    """
+    typical = max(float(np.median(deviation)) / _MEDIAN, 1.0)
+    deviation = deviation / typical
     far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
     return np.where(deviation < _REJECT, far, 0.0)
 

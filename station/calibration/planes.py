@@ -6,6 +6,7 @@ mean over a cell of pixels is exact, and three pixels give a plane without more 
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,23 +32,55 @@ _UNEVEN_M = 5e-4
 _LEAST_PATCHES = 40
 _LEAST_SHARE = 0.3
 _FOREGROUND = 0.015
+_LARGEST_SHARE_BEYOND = 0.05
+_FARTHEST_M = 3.2
+_WHOLE_PX = 5
+_LEAST_FRAME_SHARE = 0.15
 
 
-def observe_floor(depth_m: Image, frames: int, camera: CameraCalibration) -> PlaneObservation | None:
-    """The floor in an averaged image (h, w) of the empty booth; None where too little is seen.
+def observe_floor(
+    stack: NDArray[np.uint16], scale_m: float, camera: CameraCalibration
+) -> PlaneObservation | None:
+    """The floor in frames (n, h, w) of the empty booth; None where too little of it is seen.
 
     The camera stands more or less upright.
     """
-    return _observe(depth_m, frames, camera, FLOOR, axis=1, only=depth_m > 0)
+    depth_m, count = _whole_mean(stack, scale_m)
+    return _observe(depth_m, count, camera, FLOOR, axis=1, only=depth_m > 0)
 
 
 def observe_wall(
-    depth_m: Image, frames: int, camera: CameraCalibration, surface: str, background_m: Image
+    stack: NDArray[np.uint16],
+    scale_m: float,
+    camera: CameraCalibration,
+    surface: str,
+    background_m: Image,
 ) -> PlaneObservation | None:
-    """A board that was brought into the booth, in an averaged image; None where it is not seen."""
-    inverse = _inverse(depth_m)
-    only = inverse > _inverse(background_m) + _FOREGROUND
-    return _observe(depth_m, frames, camera, surface, axis=2, only=only)
+    """A board that was brought into the booth, in frames (n, h, w); None where it is not seen."""
+    depth_m, count = _whole_mean(stack, scale_m)
+    only = _inverse(depth_m) > _inverse(background_m) + _FOREGROUND
+    return _observe(depth_m, count, camera, surface, axis=2, only=only)
+
+
+def _whole_mean(stack: NDArray[np.uint16], scale_m: float) -> tuple[Image, Image]:
+    """Each pixel's mean over the frames in which all around it have readings, and their number.
+
+    Beside a missing reading stands one of its neighbours' nearest: at a slant, where many are
+    missing, that would lift a floor by millimetres.
+    """
+    total = np.zeros(stack.shape[1:], np.float32)
+    count = np.zeros(stack.shape[1:], np.float32)
+    window = np.ones((_WHOLE_PX, _WHOLE_PX), np.uint8)
+    for frame in stack:
+        whole = cv2.erode((frame > 0).astype(np.uint8), window)
+        total += frame * whole
+        count += whole
+    # An average of few frames has few to compare with; as many as there are must be there.
+    usable = count >= max(2, _LEAST_FRAME_SHARE * len(stack))
+    return (
+        np.where(usable, scale_m * total / np.maximum(count, 1), 0.0).astype(np.float32),
+        np.where(usable, count, 1.0).astype(np.float32),
+    )
 
 
 def _inverse(depth_m: Image) -> Array:
@@ -55,9 +88,9 @@ def _inverse(depth_m: Image) -> Array:
 
 
 def _observe(
-    depth_m: Image, frames: int, camera: CameraCalibration, surface: str, *, axis: int, only: Mask
+    depth_m: Image, count: Image, camera: CameraCalibration, surface: str, *, axis: int, only: Mask
 ) -> PlaneObservation | None:
-    usable = only & ~jumps(depth_m)
+    usable = only & ~jumps(depth_m) & (depth_m < _FARTHEST_M)
     inverse = _inverse(depth_m)
     ray = rays(camera).astype(np.float64)
     grid = np.zeros_like(usable)
@@ -69,7 +102,7 @@ def _observe(
         return None
     cosine = np.abs(ray @ plane) / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(plane))
     on_plane = usable & (np.abs(inverse - ray @ plane) < gate) & (cosine > _INCIDENCE_COSINE)
-    patches = _patches(inverse, on_plane, cosine, frames)
+    patches = _patches(inverse, on_plane, cosine, count)
     if len(patches) < _LEAST_PATCHES:
         return None
     return PlaneObservation(camera.name, surface, int(on_plane.sum()), patches)
@@ -92,8 +125,10 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
             continue
         if not _HEIGHT_M[0] < 1.0 / length < _HEIGHT_M[1]:
             continue
-        count = int(np.sum(np.abs(ray @ plane - inverse) < gate))
-        if count > most:
+        away = inverse - ray @ plane
+        count = int(np.sum(np.abs(away) < gate))
+        # One cannot see through it: a plane that cuts across two walls has readings beyond it.
+        if count > most and np.sum(away < -gate) < _LARGEST_SHARE_BEYOND * count:
             best, most = plane, count
     if best is None:
         return None
@@ -103,8 +138,8 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
     return best
 
 
-def _patches(inverse: Array, on_plane: Mask, cosine: Array, frames: int) -> Array:
-    """Cell means (k, 4); every pixel is the mean of some frames."""
+def _patches(inverse: Array, on_plane: Mask, cosine: Array, count: Image) -> Array:
+    """Cell means (k, 4); every pixel is the mean of a count of frames."""
     height, width = (side // _CELL_PX for side in inverse.shape)
     v, u = np.nonzero(on_plane[: height * _CELL_PX, : width * _CELL_PX])
     cell = (v // _CELL_PX) * width + u // _CELL_PX
@@ -115,6 +150,6 @@ def _patches(inverse: Array, on_plane: Mask, cosine: Array, frames: int) -> Arra
         return np.asarray(np.bincount(cell, values, minlength=len(size))[kept] / size[kept])
 
     w = mean(inverse[v, u])
-    noise = mean(SQUARE_ERROR / cosine[v, u] + ROUNDING) / (size[kept] * max(frames, 1))
+    noise = mean((SQUARE_ERROR / cosine[v, u] + ROUNDING) / count[v, u]) / size[kept]
     variance = noise + (_UNEVEN_M * w**2) ** 2
     return np.stack([mean(u.astype(float)), mean(v.astype(float)), w, variance], axis=1)

@@ -37,11 +37,12 @@ def simulate(
             time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)
             yield time_s, (TABLE[frame.raw] * np.float32(DEPTH_SCALE_M)).astype(np.float32)
 
-    def still(step: str) -> tuple[_Depth, int]:
+    def still(step: str) -> NDArray[np.uint16]:
         stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, _LOOK_S, 1)])
-        return average(stack.astype(np.uint16), DEPTH_SCALE_M).depth_m, len(stack)
+        return stack.astype(np.uint16)
 
-    background, frames = still(EMPTY)
+    empty = still(EMPTY)
+    background = average(empty, DEPTH_SCALE_M).depth_m
 
     def balls(step: str, limit_s: float | None, every: int) -> list[BallDetection]:
         found = (
@@ -50,12 +51,11 @@ def simulate(
         )
         return [detection for detection in found if detection is not None]
 
-    planes: list[PlaneObservation | None] = [observe_floor(background, frames, camera)]
+    planes: list[PlaneObservation | None] = [observe_floor(empty, DEPTH_SCALE_M, camera)]
     waved, mark, front = balls(BALL, None, stride), balls(MARK, _LOOK_S, 2), balls(FRONT, _LOOK_S, 2)
     for step in procedure.steps:
         if step.startswith("wall-"):
-            depth, frames = still(step)
-            planes.append(observe_wall(depth, frames, camera, step, background))
+            planes.append(observe_wall(still(step), DEPTH_SCALE_M, camera, step, background))
     return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
 
 

@@ -67,14 +67,15 @@ class VirtualProcedure:
         index = list(self.booth.rig.cameras).index(camera)
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, step)
-        # What stands still flickers on in a short loop; only what moves is drawn anew each frame.
-        loop = [observe(view, unit.error, rng) for _ in range(_STILL_FRAMES)]
+        # Behind what moves a short loop flickers on; only what moves is drawn anew each frame.
+        moves = step in (BALL, MARK, FRONT)
+        loop = [observe(view, unit.error, rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
         first = int(np.ceil((start_s - unit.phase_s) * FRAME_RATE_HZ))
         lasts_s = min(self._lasts_s(step), limit_s or np.inf)
         for sequence in range(first, first + int(lasts_s * FRAME_RATE_HZ), stride):
             time_s = unit.phase_s + sequence / FRAME_RATE_HZ
-            raw = loop[int(rng.integers(_STILL_FRAMES))]
+            raw = loop[int(rng.integers(len(loop)))] if moves else observe(view, unit.error, rng)
             drawn = overlay(view, calibration, self._moving(step, time_s))
             if drawn is not None:
                 part, window = drawn
