@@ -72,7 +72,9 @@ def observations(
     return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
 
 
-def _measured(unit: SimulatedUnit, camera: CameraCalibration, u: Array, v: Array, w: Array) -> Array:
+def _measured(
+    unit: SimulatedUnit, camera: CameraCalibration, u: Array, v: Array, w: Array
+) -> Array:
     """Inverse depths as the unit reports them."""
     columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
     found = [
@@ -146,4 +148,6 @@ def _floor(
     u, v, w = u[seen], v[seen], w[seen]
     variance = (SQUARE_ERROR / cosine[seen] + ROUNDING) / (12**2 * 30) + (5e-4 * w**2) ** 2
     measured = _measured(unit, camera, u, v, w) + rng.normal(0.0, np.sqrt(variance))
-    return PlaneObservation(camera.name, FLOOR, 12**2 * len(u), np.stack([u, v, measured, variance], axis=1))
+    return PlaneObservation(
+        camera.name, FLOOR, 12**2 * len(u), np.stack([u, v, measured, variance], axis=1)
+    )

@@ -121,7 +121,9 @@ def _candidates(
     shape = cells.max(axis=0) + 2
     counts = np.bincount(np.ravel_multi_index(tuple(cells.T), tuple(shape)), minlength=shape.prod())
     grid = counts.reshape(shape).astype(np.float32)
-    close, around = (size**3 * ndimage.uniform_filter(grid, size, mode="constant") for size in (3, 7))
+    close, around = (
+        size**3 * ndimage.uniform_filter(grid, size, mode="constant") for size in (3, 7)
+    )
     # A wall's votes lie on a plane and an arm's on a line: their surroundings are full of votes, too.
     # What is near covers more pixels: votes count as a share of what a ball there would give.
     depths = np.maximum(low[2] + (np.arange(shape[2]) + 0.5) * _CELL_M, 0.3).astype(np.float32)
@@ -258,9 +260,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
     )
 
 
-def _window(
-    camera: CameraCalibration, center: Array, reach_m: float
-) -> tuple[slice, slice] | None:
+def _window(camera: CameraCalibration, center: Array, reach_m: float) -> tuple[slice, slice] | None:
     if center[2] < _RANGE_M[0]:
         return None
     u, v = project(camera, center[None])[0]
@@ -362,15 +362,15 @@ def _ball_image(ray, center, radius):  # type: ignore[no-untyped-def]  # pragma:
     return expected, cosine
 
 
-def _is_ball(
-    part: Image, ray: Image, center: Array, radius: float, used: int, seen: int
-) -> bool:
+def _is_ball(part: Image, ray: Image, center: Array, radius: float, used: int, seen: int) -> bool:
     """Enough of it is seen, and around it one sees past it."""
     if used < _LEAST_VISIBLE * seen:
         return False
-    away = np.linalg.norm(
-        np.cross(ray, center / np.linalg.norm(center)), axis=-1
-    ) / np.linalg.norm(ray, axis=-1) * np.linalg.norm(center)
+    away = (
+        np.linalg.norm(np.cross(ray, center / np.linalg.norm(center)), axis=-1)
+        / np.linalg.norm(ray, axis=-1)
+        * np.linalg.norm(center)
+    )
     ring = (away > 1.06 * radius) & (away < 1.25 * radius)
     past = part[ring] < 1.0 / (center[2] + 0.3 * radius)
     return bool(ring.any() and past.mean() > _OPEN_RING_SHARE)

@@ -50,6 +50,4 @@ def design(inverse: Array, place: Array) -> Array:
 def correction_of(parameters: Array) -> DepthCorrection:
     """The correction as the calibration file has it."""
     p0, p1, p2, gx, gy = (float(value) for value in parameters)
-    return DepthCorrection(
-        (p0 + p2 * MIDDLE**2, 1.0 + p1 - 2.0 * p2 * MIDDLE, p2), (gx, gy)
-    )
+    return DepthCorrection((p0 + p2 * MIDDLE**2, 1.0 + p1 - 2.0 * p2 * MIDDLE, p2), (gx, gy))

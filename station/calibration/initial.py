@@ -107,7 +107,7 @@ def named_surfaces(
     found: list[Surface] = []
     for surface in dict.fromkeys(seen.surface for seen in planes):
         views = [
-            (seen, _in_reference(Surface.of(cameras[seen.camera], seen, surface), poses))
+            (seen, _facing(Surface.of(cameras[seen.camera], seen, surface), poses))
             for seen in planes
             if seen.surface == surface and seen.camera in poses
         ]
@@ -122,17 +122,16 @@ def named_surfaces(
     return found
 
 
-def _in_reference(surface: Surface, poses: Mapping[str, Array]) -> Array:
-    """q (3,) of q . X = 1 in the reference frame."""
+def _facing(surface: Surface, poses: Mapping[str, Array]) -> tuple[Array, float]:
+    """Unit normal (3,) away from the camera, reference frame, and d of normal . X = d."""
     pose = poses[surface.camera]
-    facing = pose[:3, :3] @ surface.plane
-    return np.asarray(facing / (1.0 + facing @ pose[:3, 3]))
+    away = pose[:3, :3] @ surface.plane
+    length = np.linalg.norm(away)
+    return away / length, float((1.0 + away @ pose[:3, 3]) / length)
 
 
-def _one_plane(q: Array, other: Array) -> bool:
-    lengths = np.linalg.norm(q), np.linalg.norm(other)
-    turned = q @ other < _SAME_COSINE * lengths[0] * lengths[1]
-    return not turned and abs(1.0 / lengths[0] - 1.0 / lengths[1]) < _SAME_DISTANCE_M
+def _one_plane(view: tuple[Array, float], other: tuple[Array, float]) -> bool:
+    return bool(view[0] @ other[0] > _SAME_COSINE and abs(view[1] - other[1]) < _SAME_DISTANCE_M)
 
 
 def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
@@ -153,7 +152,8 @@ def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
     planes: dict[str, Array] = {}
     for surface in problem.surfaces:
         if surface.surface not in planes:
-            planes[surface.surface] = _in_reference(surface, poses)
+            normal, distance_m = _facing(surface, poses)
+            planes[surface.surface] = normal / distance_m
     return State(
         poses=dict(poses),
         clock_s=dict.fromkeys(problem.cameras, 0.0),
@@ -163,5 +163,3 @@ def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
         places=places,
         planes=planes,
     )
-
-

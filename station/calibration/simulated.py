@@ -52,7 +52,11 @@ def simulate(
         return [detection for detection in found if detection is not None]
 
     planes: list[PlaneObservation | None] = [observe_floor(empty, DEPTH_SCALE_M, camera)]
-    waved, mark, front = balls(BALL, None, stride), balls(MARK, _LOOK_S, 2), balls(FRONT, _LOOK_S, 2)
+    waved, mark, front = (
+        balls(BALL, None, stride),
+        balls(MARK, _LOOK_S, 2),
+        balls(FRONT, _LOOK_S, 2),
+    )
     for step in procedure.steps:
         if step.startswith("wall-"):
             planes.append(observe_wall(still(step), DEPTH_SCALE_M, camera, step, background))
