@@ -92,12 +92,39 @@ class CameraMove:
         hidden = (_CERTAINTY + _POWER) * sigmas + _GUARD_M > MOVED_M
         return list(directions.T[hidden])
 
+    def words(self) -> str:
+        """What the operator should know, in one sentence."""
+        if self.lost:
+            return (
+                f"camera {self.camera} no longer sees what it saw when it was calibrated "
+                f"({100 * self.share:.0f} % of it): it was turned away, or something stands in its "
+                "way"
+            )
+        if not self.moved:
+            return f"camera {self.camera} stands where it was calibrated"
+        size, sigmas, directions = self._along()
+        sure = np.where(np.abs(size) > _CERTAINTY * sigmas, size, 0.0)
+        turn, shift = np.split(directions @ sure / _SCALE, 2)
+        degrees, millimetres = np.degrees(np.linalg.norm(turn)), 1e3 * np.linalg.norm(shift)
+        return (
+            f"camera {self.camera} has moved since it was calibrated, by about "
+            f"{millimetres:.0f} mm and {degrees:.1f} degrees"
+        )
+
+    def unseen_words(self) -> list[str]:
+        """The directions of ``unseen``, by what they mostly are."""
+        return [_MOTIONS[int(np.argmax(np.abs(direction)))] for direction in self.unseen()]
+
     def _along(self) -> tuple[Array, Array, Array]:
         """Sizes, standard deviations (6,) and directions (6, 6) of independent components."""
         variances, directions = np.linalg.eigh(self.covariance * np.outer(_SCALE, _SCALE))
         return directions.T @ (self.xi * _SCALE), np.sqrt(np.maximum(variances, 0.0)), directions
 
 
+_MOTIONS = (
+    "nodding", "turning left or right", "tilting",
+    "sideways", "up or down", "forward or back",
+)  # fmt: skip
 _SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
 
 
@@ -206,8 +233,8 @@ def estimate_move(
     background was stored.
     """
     inverse = [inverse_depth(frame, scale_m) for frame in frames]
-    share = np.mean([image > 0 for image in inverse], axis=0, dtype=np.float32)
-    surface, with_gaps = smoothed(np.mean(inverse, axis=0), share)
+    share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
+    surface, with_gaps = smoothed(np.asarray(np.mean(inverse, axis=0)), np.asarray(share))
     now = np.where(reference.outline, with_gaps, surface)[reference.rows, reference.columns]
     variance = reference.noise**2 * (1.0 / len(frames) + 1.0 / reference.frames) + _FLOOR_PER_M**2
     on_outline = reference.outline[reference.rows, reference.columns]

@@ -101,7 +101,7 @@ def smoothed(inverse: Image, share: Image) -> tuple[Image, Image]:
     """Smoothed images: of the surface, over its readings alone, and with 0 for no reading."""
     with_gaps = np.asarray(cv2.GaussianBlur(inverse, (0, 0), SMOOTHING_PX), np.float32)
     there = cv2.GaussianBlur(share, (0, 0), SMOOTHING_PX)
-    return with_gaps / np.maximum(there, _LEAST_SHARE), with_gaps
+    return np.asarray(with_gaps / np.maximum(there, _LEAST_SHARE), np.float32), with_gaps
 
 
 def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticView:
@@ -129,4 +129,5 @@ def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticV
         raise ValueError("a static view needs at least two frames")
     variance = (spread - np.square(level) / count) / (count - 1)
     noise, outline_noise = np.sqrt(np.maximum(variance, 0.0))
-    return StaticView(total / count, seen / count, noise, outline_noise, count)
+    n = np.float32(count)
+    return StaticView(total / n, seen / n, noise, outline_noise, count)
