@@ -28,10 +28,13 @@ MOVED_RAD = float(np.radians(0.3))
 """A camera that moved by either has to be named."""
 LEVER_M = MOVED_M / MOVED_RAD
 """Turns rotations into metres, so that both limits are one length."""
-_CERTAINTY = 3.5
-_GUARD_M = 0.0015
-"""A move counts beyond so many standard deviations, and by so much more: warmth, quantisation."""
+_CERTAINTY = 4.2
+"""Standard deviations beyond which a direction alarms: with four cameras, of which each sees two
+directions badly, once in 5,000 scans."""
+_GUARD_M = 0.001
+"""Nothing smaller alarms however certain it is: warmth, the sensor's own steps."""
 _POWER = 2.0
+"""A move is surely noticed so many standard deviations beyond what alarms."""
 _STRIDE_PX = 8
 """Samples this far apart, after smoothing, are nearly independent ..."""
 _CORRELATION = 2.5
@@ -76,12 +79,12 @@ class CameraMove:
     @property
     def moved(self) -> bool:
         """It has to be calibrated again before the next scan."""
-        return not self.lost and self.surely_moved_m() > _GUARD_M
+        return not self.lost and self.alarm() > 1.0
 
-    def surely_moved_m(self) -> float:
-        """The least move that the estimate allows, in metres with rotations times LEVER_M."""
+    def alarm(self) -> float:
+        """The move as a share of what alarms, in the direction in which it is the largest."""
         size, sigmas, _ = self._along()
-        return float(np.linalg.norm(np.maximum(np.abs(size) - _CERTAINTY * sigmas, 0.0)))
+        return float(np.max(np.abs(size) / _limits(sigmas)))
 
     def unseen(self) -> list[Array]:
         """Unit directions (6,) along which a move of MOVED_M or MOVED_RAD may stay unnoticed.
@@ -89,7 +92,7 @@ class CameraMove:
         Rotation vector times LEVER_M and translation, camera frame.
         """
         _, sigmas, directions = self._along()
-        hidden = (_CERTAINTY + _POWER) * sigmas + _GUARD_M > MOVED_M
+        hidden = _limits(sigmas) + _POWER * sigmas > MOVED_M
         return list(directions.T[hidden])
 
     def words(self) -> str:
@@ -103,7 +106,7 @@ class CameraMove:
         if not self.moved:
             return f"camera {self.camera} stands where it was calibrated"
         size, sigmas, directions = self._along()
-        sure = np.where(np.abs(size) > _CERTAINTY * sigmas, size, 0.0)
+        sure = np.where(np.abs(size) > _limits(sigmas), size, 0.0)
         turn, shift = np.split(directions @ sure / _SCALE, 2)
         degrees, millimetres = np.degrees(np.linalg.norm(turn)), 1e3 * np.linalg.norm(shift)
         return (
@@ -121,6 +124,10 @@ class CameraMove:
         return directions.T @ (self.xi * _SCALE), np.sqrt(np.maximum(variances, 0.0)), directions
 
 
+def _limits(sigmas: Array) -> Array:
+    return np.hypot(_CERTAINTY * sigmas, _GUARD_M)
+
+
 _MOTIONS = (
     "nodding", "turning left or right", "tilting",
     "sideways", "up or down", "forward or back",
@@ -134,12 +141,13 @@ class DriftReference:
 
     camera: CameraCalibration
     frames: int
-    image: Image
-    """(h, w) smoothed inverse depth as it is compared."""
-    outline: NDArray[np.bool_]
     rows: NDArray[np.intp]
     """(r, c) pixel rows of the samples."""
     columns: NDArray[np.intp]
+    image: Array
+    """(r, c) smoothed inverse depth."""
+    outline: NDArray[np.bool_]
+    """(r, c): where depth jumps; no reading counts as 0 there."""
     usable: NDArray[np.bool_]
     """(r, c)"""
     noise: Array
@@ -151,7 +159,7 @@ class DriftReference:
     visible: Array
     """(r, c): share of it in the smoothed pixel."""
     steepness: Array
-    """(r, c): of the image, 1/m per pixel."""
+    """(r, c): the steepest slope of the image around, 1/m per pixel."""
 
     @classmethod
     def prepare(cls, camera: CameraCalibration, view: StaticView) -> DriftReference:
@@ -167,6 +175,7 @@ class DriftReference:
         slope = np.where(outline[..., None], steep, _slope(wide))
         nearest = np.where(outline, cv2.dilate(surface, reach), surface)
         usable = calm | (outline & (nearest > 1.0 / _FARTHEST_OUTLINE_M))
+        steepness = np.hypot(slope[..., 0], slope[..., 1])
         half = _STRIDE_PX // 2
         rows, columns = np.mgrid[
             half : camera.height : _STRIDE_PX, half : camera.width : _STRIDE_PX
@@ -179,16 +188,16 @@ class DriftReference:
         return cls(
             camera=camera,
             frames=view.frames,
-            image=image,
-            outline=outline,
             rows=rows,
             columns=columns,
+            image=image[rows, columns].astype(np.float64),
+            outline=outline[rows, columns],
             usable=usable[rows, columns],
             noise=noise.astype(np.float64),
             jacobian=_jacobian(camera, points, visible, sampled),
             points=points,
             visible=visible,
-            steepness=np.hypot(sampled[..., 0], sampled[..., 1]),
+            steepness=np.asarray(cv2.dilate(steepness, reach)[rows, columns], np.float64),
         )
 
 
@@ -234,13 +243,11 @@ def estimate_move(
     """
     inverse = [inverse_depth(frame, scale_m) for frame in frames]
     share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
-    surface, with_gaps = smoothed(np.asarray(np.mean(inverse, axis=0)), np.asarray(share))
-    now = np.where(reference.outline, with_gaps, surface)[reference.rows, reference.columns]
+    now = smoothed(np.asarray(np.mean(inverse, axis=0)), np.asarray(share))
     variance = reference.noise**2 * (1.0 / len(frames) + 1.0 / reference.frames) + _FLOOR_PER_M**2
-    on_outline = reference.outline[reference.rows, reference.columns]
     xi = np.zeros(6)
     for samples, sigma_m in (
-        (reference.usable & ~on_outline, _COARSE_SIGMA_M),
+        (reference.usable & ~reference.outline, _COARSE_SIGMA_M),
         (reference.usable, _FINE_SIGMA_M),
     ):
         same = samples & ~_changed(reference, now, xi)
@@ -253,7 +260,7 @@ def estimate_move(
 
 def _align(
     reference: DriftReference,
-    now: Array,
+    now: tuple[Image, Image],
     variance: Array,
     same: NDArray[np.bool_],
     xi: Array,
@@ -262,32 +269,43 @@ def _align(
     jacobian = reference.jacobian[same] / np.sqrt(variance[same])[:, None]
     prior = np.diag(np.square(_SCALE / prior_sigma_m))
     for _ in range(_ITERATIONS):
-        off = (now - _predicted(reference, xi))[same] / np.sqrt(variance[same])
-        size = max(1.0, 1.4826 * float(np.median(np.abs(off))))
-        weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * size))))
-        weighted = jacobian * weights[:, None]
-        information = jacobian.T @ weighted / (_CORRELATION * size**2) + prior
-        pull = weighted.T @ off / (_CORRELATION * size**2) - prior @ xi
-        xi = xi + np.linalg.solve(information, pull)
+        off, inside = _off(reference, now, xi)
+        off, known = off[same] / np.sqrt(variance[same]), inside[same]
+        size = max(1.0, 1.4826 * float(np.median(np.abs(off[known]))))
+        weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * size)))) * known
+        weighted = jacobian * weights[:, None] / (_CORRELATION * size**2)
+        information = jacobian.T @ weighted + prior
+        xi = xi + np.linalg.solve(information, weighted.T @ off - prior @ xi)
     return xi, np.linalg.inv(information)
 
 
-def _changed(reference: DriftReference, now: Array, xi: Array) -> NDArray[np.bool_]:
+def _changed(reference: DriftReference, now: tuple[Image, Image], xi: Array) -> NDArray[np.bool_]:
     """(r, c): where something stands that did not, or stands no longer, with its shadow."""
     gate = _CHANGED_PER_M + _CHANGED_PX * reference.steepness
-    changed = (np.abs(now - _predicted(reference, xi)) > gate) & reference.usable
+    off, inside = _off(reference, now, xi)
+    changed = (np.abs(off) > gate) & reference.usable & inside
     reach = np.ones((2 * _SHADOW_CELLS + 1,) * 2, np.uint8)
     return cv2.dilate(changed.astype(np.uint8), reach).astype(bool)
 
 
-def _predicted(reference: DriftReference, xi: Array) -> Array:
-    """The smoothed inverse depth (r, c), had the camera moved by xi."""
+def _off(
+    reference: DriftReference, now: tuple[Image, Image], xi: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """By how much the images differ from what is expected had the camera moved by xi, (r, c).
+
+    The stored samples are looked for where they are now (Baker & Matthews 2004, "Lucas-Kanade 20
+    years on": inverse compositional), so their sensitivities hold for any xi. Also tells which of
+    them are inside the images.
+    """
     points = reference.points
     there = transform(invert(se3_exp(xi)), points)
     K = reference.camera.K
     shift = there[..., :2] / there[..., 2:] - points[..., :2] / points[..., 2:]
-    x = (reference.columns - K[0, 0] * shift[..., 0]).astype(np.float32)
-    y = (reference.rows - K[1, 1] * shift[..., 1]).astype(np.float32)
-    then = cv2.remap(reference.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    # What is seen here now was seen a shift away then.
-    return np.asarray(then + reference.visible * (1.0 / there[..., 2] - 1.0 / points[..., 2]))
+    x = (reference.columns + K[0, 0] * shift[..., 0]).astype(np.float32)
+    y = (reference.rows + K[1, 1] * shift[..., 1]).astype(np.float32)
+    surface, with_gaps = (cv2.remap(image, x, y, cv2.INTER_LINEAR) for image in now)
+    seen = np.where(reference.outline, with_gaps, surface)
+    nearer = reference.visible * (1.0 / there[..., 2] - 1.0 / points[..., 2])
+    height, width = now[0].shape
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    return seen - (reference.image + nearer), inside
