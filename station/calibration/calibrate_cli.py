@@ -20,7 +20,13 @@ from station.calibration.guide import Guide
 from station.calibration.rig import Rig
 from station.calibration.session import BALL, EMPTY, FRONT, MARK, WALL, Lens, Session
 from station.calibration.session import SESSION as SESSION_FILE
-from station.calibration.steps import look_at_empty_booth, look_at_wall, rest_ball, wave_ball
+from station.calibration.steps import (
+    covered,
+    look_at_empty_booth,
+    look_at_wall,
+    rest_ball,
+    wave_ball,
+)
 from station.calibration.store import CalibrationStore
 from station.config import BoothConfig, find_config, load_config
 from station.errors import CalibrationError
@@ -156,7 +162,7 @@ def _guided(booth: _Booth) -> None:
         click.echo(f"going on with the calibration that was begun {session.started}")
     if session is None or not session.done(EMPTY):
         _empty(booth)
-    if session is None or not session.balls:
+    if session is None or not covered(session, booth.config.reference).enough:
         _ball(booth)
     if session is None or not session.done(MARK):
         _rest(booth, MARK)

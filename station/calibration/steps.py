@@ -63,9 +63,12 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     cameras, name = session.lensed_cameras(), f"wall-{place}"
     walls: list[PlaneObservation] = []
     for camera, view in views.items():
-        wall = observe_wall(
-            view.depth_m(), view.frames, cameras[camera], name, _background(session, camera)
-        )
+        background = _background(session, camera)
+        if background is None:
+            raise CalibrationError(
+                "the empty booth has to be looked at first: station calibrate floor"
+            )
+        wall = observe_wall(view.depth_m(), view.frames, cameras[camera], name, background)
         if wall is not None:
             walls.append(wall)
     if not walls:
@@ -132,6 +135,14 @@ def _at_rest(seen: list[BallDetection]) -> bool:
     return bool(np.median(away) < _RESTING_M)
 
 
+def covered(session: Session, reference: str) -> Coverage:
+    """What has been seen of the waved ball so far."""
+    coverage = Coverage(session.lensed_cameras(), reference)
+    for ball in session.balls:
+        coverage.add(ball)
+    return coverage
+
+
 def wave_ball(
     feed: Feed, session: Session, guide: Guide, *, reference: str, lasts_s: float
 ) -> None:
@@ -140,9 +151,7 @@ def wave_ball(
     What was seen is on disk within a second; Ctrl-C ends the step and keeps it.
     """
     finder = _BallFinder(session)
-    coverage = Coverage(session.cameras, reference)
-    for ball in session.balls:
-        coverage.add(ball)
+    coverage = covered(session, reference)
     session.begin_run()
     resets = feed.clock_resets()
     waiting: list[BallDetection] = []
