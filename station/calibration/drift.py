@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.rig import CameraCalibration
-from station.calibration.scene import Image, StaticView, inverse_depth, smoothed
+from station.calibration.scene import SMOOTHING_PX, Image, StaticView, inverse_depth, smoothed
 from station.depth.points import rays
 from station.geometry import invert, se3_exp, skew, transform
 
@@ -45,6 +45,11 @@ _WIDE_PX = 10.0
 """Slopes of smooth surfaces are taken over this width: noise in them would pass for structure."""
 _EDGE_PER_M_PX = 0.008
 """A steeper slope, 1/m per pixel, is an outline: a floor seen at a grazing angle has 0.003."""
+_GRADUAL, _SHARPER = 4.0, 2.0
+"""An outline is steeper than the picture smoothed so many times wider by at least this factor;
+a floor that fades out at a grazing angle is not, and it does not move with the picture."""
+_OFTEN = 0.4
+"""A surface is used where this share of the frames has a reading."""
 _EDGE_REACH_PX = 7
 _FARTHEST_OUTLINE_M = 4.0
 """Farther surfaces end where the sensor's range ends, which is not an outline."""
@@ -55,8 +60,8 @@ _SHADOW_CELLS = 2
 _LEAST_SHARE = 0.15
 _COARSE_SIGMA_M, _FINE_SIGMA_M = 0.02, 0.2
 """Directions that nothing shows must not wander: first by less than an outline can follow."""
-_ITERATIONS = 6
-_TUKEY = 4.685
+_ITERATIONS = 10
+_HUBER, _TUKEY = 1.345, 4.685
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +171,14 @@ class DriftReference:
         """Find outlines, slopes and sensitivities of a stored view."""
         surface, with_gaps = smoothed(view.inverse_depth, view.share)
         steep = _slope(with_gaps)
-        edge = np.hypot(steep[..., 0], steep[..., 1]) > _EDGE_PER_M_PX
+        sharpness = np.hypot(steep[..., 0], steep[..., 1])
+        gradual = _slope(cv2.GaussianBlur(with_gaps, (0, 0), _GRADUAL * SMOOTHING_PX))
+        edge = (sharpness > _EDGE_PER_M_PX) & (
+            sharpness > _SHARPER * np.hypot(gradual[..., 0], gradual[..., 1])
+        )
         reach = np.ones((2 * _EDGE_REACH_PX + 1,) * 2, np.uint8)
         outline = cv2.dilate(edge.astype(np.uint8), reach).astype(bool)
-        calm = (view.share > 0.9) & ~outline
+        calm = (view.share > _OFTEN) & ~outline
         image = np.where(outline, with_gaps, surface)
         wide = _filled_blur(surface, calm)
         slope = np.where(outline[..., None], steep, _slope(wide))
@@ -237,7 +246,7 @@ def estimate_move(
 ) -> CameraMove:
     """Align frames (h, w) in units of scale_m, taken at one moment, with the stored background.
 
-    Gauss-Newton over xi with Tukey's weights, first over surfaces, then with outlines, which see
+    Robust Gauss-Newton over xi, first over surfaces, then with outlines, which see
     only a few pixels far. The covariance is that of the sensor's own noise, as measured when the
     background was stored.
     """
@@ -268,15 +277,26 @@ def _align(
 ) -> tuple[Array, Array]:
     jacobian = reference.jacobian[same] / np.sqrt(variance[same])[:, None]
     prior = np.diag(np.square(_SCALE / prior_sigma_m))
-    for _ in range(_ITERATIONS):
+    for iteration in range(_ITERATIONS):
         off, inside = _off(reference, now, xi)
         off, known = off[same] / np.sqrt(variance[same]), inside[same]
         size = max(1.0, 1.4826 * float(np.median(np.abs(off[known]))))
-        weights = np.square(np.maximum(0.0, 1.0 - np.square(off / (_TUKEY * size)))) * known
+        weights = _weights(np.abs(off) / size, convex=iteration < _ITERATIONS // 2) * known
         weighted = jacobian * weights[:, None] / (_CORRELATION * size**2)
         information = jacobian.T @ weighted + prior
         xi = xi + np.linalg.solve(information, weighted.T @ off - prior @ xi)
     return xi, np.linalg.inv(information)
+
+
+def _weights(off: Array, convex: bool) -> Array:
+    """Of deviations in standard deviations: Huber's first, then Tukey's.
+
+    Few samples see some directions (the floor: up and down); what most of them call an outlier at
+    the start may be what they tell.
+    """
+    if convex:
+        return np.asarray(_HUBER / np.maximum(off, _HUBER))
+    return np.asarray(np.square(np.maximum(0.0, 1.0 - np.square(off / _TUKEY))))
 
 
 def _changed(reference: DriftReference, now: tuple[Image, Image], xi: Array) -> NDArray[np.bool_]:
