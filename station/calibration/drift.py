@@ -172,7 +172,8 @@ class DriftReference:
         surface, with_gaps = smoothed(view.inverse_depth, view.share)
         steep = _slope(with_gaps)
         sharpness = np.hypot(steep[..., 0], steep[..., 1])
-        gradual = _slope(cv2.GaussianBlur(with_gaps, (0, 0), _GRADUAL * SMOOTHING_PX))
+        wider = cv2.GaussianBlur(with_gaps, (0, 0), _GRADUAL * SMOOTHING_PX)
+        gradual = _slope(np.asarray(wider, np.float32))
         edge = (sharpness > _EDGE_PER_M_PX) & (
             sharpness > _SHARPER * np.hypot(gradual[..., 0], gradual[..., 1])
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
-from station.drivers.virtual_calibration import EMPTY, VirtualProcedure
+from station.drivers.virtual_calibration import BALL, VirtualProcedure
 from station.drivers.virtual_scene import fixed_posts, load_mesh
 from station.recording import RecordedFrame, write_recording
 
@@ -19,7 +19,7 @@ PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error where a calibration has to find it."""
 _STRIDE = 3
-"""Of a calibration every third frame is kept: what is looked at is slower than the sensors."""
+"""Of the waved ball every third frame is kept: who looks for it is slower than the sensors."""
 _PROCESSES = 2
 
 
@@ -106,7 +106,7 @@ def _record_person(
 
 
 def _record_step(procedure: VirtualProcedure, name: str, step: str, folder: Path) -> int:
-    stride = 1 if step == EMPTY else _STRIDE
+    stride = _STRIDE if step == BALL else 1
     return write_recording(folder, _frames_of(procedure, name, step, stride), tick_hz=TICK_HZ)
 
 
