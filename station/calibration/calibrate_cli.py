@@ -99,6 +99,8 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(
         *args: Any, config_path: Path | None, recordings: Path | None, yes: bool, **kwargs: Any
     ) -> Any:
+        if click.get_current_context().invoked_subcommand is not None:
+            return None  # the step has these options itself
         config = load_config(find_config(config_path))
         store = CalibrationStore(config.calibrate.folder, config.calibration)
         attended = not yes and recordings is None
@@ -112,11 +114,8 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--use", "use_name", metavar="DATE", help="put a stored calibration into use")
 @click.option("--list", "list_them", is_flag=True, help="show the stored calibrations")
 @click.option("--new", is_flag=True, help="begin anew; what was seen so far is set aside")
-@click.pass_context
 @_options
-def calibrate(
-    booth: _Booth, context: click.Context, use_name: str | None, list_them: bool, new: bool
-) -> None:
+def calibrate(booth: _Booth, use_name: str | None, list_them: bool, new: bool) -> None:
     """Find where the cameras are: empty booth, a waved ball, the mark, then the solution.
 
     Without a step all of them are done, guided, from where the last attempt ended. Every result is
@@ -130,8 +129,6 @@ def calibrate(
       station calibrate --list
       station calibrate --use 20261121T100000Z
     """
-    if context.invoked_subcommand is not None:
-        return
     if list_them:
         _list(booth.store)
     elif use_name:

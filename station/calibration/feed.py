@@ -120,7 +120,12 @@ class Feed:
         return bool(self._clocks) and all(clock.over for clock in self._clocks.values())
 
     def clock_resets(self) -> dict[str, int]:
-        """How often each camera's clock was reset since its process began."""
+        """How often each camera's clock was reset since its process began.
+
+        Replays have the clocks of their recordings, whatever becomes of the replay's.
+        """
+        if self._clocks:
+            return {}
         return {name: health.clock_resets for name, health in self._health.items()}
 
     def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
