@@ -181,6 +181,8 @@ def wave_ball(
             session.keep_balls(waiting)
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
+    for name, (near, moments) in coverage.ties().items():
+        guide.say(f"{name} is tied to {near} by {moments} moments at which both saw it")
     if not coverage.enough:
         guide.say(f"more would help: {coverage.advice()}")
 
