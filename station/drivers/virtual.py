@@ -79,9 +79,7 @@ class SimulatedUnit:
         """A camera's unit; the same in every simulation of this booth."""
         rng = np.random.default_rng((booth.seed, list(booth.rig.cameras).index(name), 1))
         return cls(
-            error=UnitError(
-                booth.bias_m * rng.uniform(-1.0, 1.0), tuple(rng.uniform(-0.3, 0.3, 2))
-            ),
+            error=UnitError(booth.bias_m * rng.uniform(-1.0, 1.0), tuple(rng.uniform(-0.3, 0.3, 2))),
             drift=rng.uniform(-80e-6, 80e-6),
             phase_s=rng.uniform(0.0, 1.0 / FRAME_RATE_HZ),
             first_tick=int(rng.integers(0, 2**32)),
