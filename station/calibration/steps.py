@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
 
 from station.calibration.ball import find_ball
 from station.calibration.coverage import Coverage
@@ -15,7 +16,7 @@ from station.calibration.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide import Guide
 from station.calibration.planes import observe_floor, observe_wall
 from station.calibration.rig import CameraCalibration
-from station.calibration.scene import Image, StaticView, static_view
+from station.calibration.scene import Image, static_view
 from station.calibration.session import Session
 from station.errors import CalibrationError
 
@@ -27,6 +28,7 @@ _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
 _KEEP_EVERY_S = 1.0
 _DETECTORS = 2
+_OFTEN = 0.9
 _MOVED_PER_M, _MOVED_SHARE = 0.03, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
 
@@ -37,17 +39,18 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
     Raises:
         CalibrationError: something moved, or no camera sees the floor.
     """
-    views = _still_views(feed, session, guide, _EMPTY_FRAMES)
+    taken = _still_frames(feed, session, guide, _EMPTY_FRAMES)
     cameras = session.lensed_cameras()
     floors = [
         floor
-        for name, view in views.items()
-        if (floor := observe_floor(view.depth_m(), view.frames, cameras[name])) is not None
+        for name, (stack, scale_m) in taken.items()
+        if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
     ]
     if not floors:
         raise CalibrationError(
             "no camera sees the floor: free it in front of the lower cameras, or tilt one down"
         )
+    views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
     session.keep_empty(views, floors)
     seen = ", ".join(floor.camera for floor in floors)
     guide.done(f"empty booth kept; the floor is seen by {seen}")
@@ -59,16 +62,16 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     Raises:
         CalibrationError: no camera sees a flat surface that was not there before.
     """
-    views = _still_views(feed, session, guide, _WALL_FRAMES)
+    taken = _still_frames(feed, session, guide, _WALL_FRAMES)
     cameras, name = session.lensed_cameras(), f"wall-{place}"
     walls: list[PlaneObservation] = []
-    for camera, view in views.items():
+    for camera, (stack, scale_m) in taken.items():
         background = _background(session, camera)
         if background is None:
             raise CalibrationError(
                 "the empty booth has to be looked at first: station calibrate floor"
             )
-        wall = observe_wall(view.depth_m(), view.frames, cameras[camera], name, background)
+        wall = observe_wall(stack, scale_m, cameras[camera], name, background)
         if wall is not None:
             walls.append(wall)
     if not walls:
@@ -79,23 +82,29 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
 
-def _still_views(feed: Feed, session: Session, guide: Guide, frames: int) -> dict[str, StaticView]:
+def _still_frames(
+    feed: Feed, session: Session, guide: Guide, frames: int
+) -> dict[str, tuple[NDArray[np.uint16], float]]:
+    """Each camera's frames (n, h, w) of a booth in which nothing moves, and their scale."""
     taken = gather_frames(feed, session.cameras, frames, guide.progress)
-    return {name: _still_view(name, seen) for name, seen in taken.items()}
+    for name, seen in taken.items():
+        _check_stillness(name, seen)
+    return {
+        name: (np.stack([frame.depth for frame in seen]), seen[0].scale_m)
+        for name, seen in taken.items()
+    }
 
 
-def _still_view(name: str, frames: list[TimedFrame]) -> StaticView:
-    scale_m = frames[0].scale_m
-    half = len(frames) // 2
+def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
+    scale_m, half = frames[0].scale_m, len(frames) // 2
     before = static_view((frame.depth for frame in frames[:half]), scale_m)
     after = static_view((frame.depth for frame in frames[half:]), scale_m)
-    both = (before.share > 0.9) & (after.share > 0.9)
+    both = (before.share > _OFTEN) & (after.share > _OFTEN)
     change = np.abs(before.inverse_depth - after.inverse_depth)[both]
     if float(np.mean(change > _MOVED_PER_M)) > _MOVED_SHARE:
         raise CalibrationError(
             f"something moved in front of camera {name}; leave the booth and do it again"
         )
-    return static_view((frame.depth for frame in frames), scale_m)
 
 
 def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
