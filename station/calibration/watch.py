@@ -12,7 +12,7 @@ from station.calibration.drift import CameraMove, DriftReference, estimate_move
 from station.calibration.rig import CameraCalibration
 from station.calibration.scene import StaticView
 from station.calibration.store import CalibrationStore
-from station.errors import BoothError
+from station.errors import BoothError, CalibrationError
 
 
 class DriftWatch:
@@ -27,11 +27,21 @@ class DriftWatch:
     def moves(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
     ) -> list[CameraMove]:
-        """How far a camera stands off, by frames of one moment; none where nothing was stored."""
+        """How far a camera stands off, by frames of one moment; none where nothing was stored.
+
+        Raises:
+            CalibrationError: the camera's images are of another size than when it was calibrated.
+        """
         self._follow()
         view = self._views.get(camera.name)
         if view is None:
             return []
+        if frames[0].shape != view.inverse_depth.shape:
+            height, width = frames[0].shape
+            raise CalibrationError(
+                f"camera {camera.name} gives images of {width} x {height}, not those that it was "
+                "calibrated with; run station calibrate"
+            )
         if camera.name not in self._references:
             self._references[camera.name] = DriftReference.prepare(camera, view)
         return [estimate_move(self._references[camera.name], frames, scale_m)]
