@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-fit
+BENCHES := bench-capture bench-fit bench-drift
 
 .PHONY: help demo test check format train clean $(BENCHES)
 
@@ -34,7 +34,7 @@ train: $(VENV)/train.stamp
 
 # The benchmark of the fit renders bodies that the model never saw, which takes the training extra.
 bench-fit: $(VENV)/train.stamp
-bench-capture: $(VENV)/dev.stamp
+bench-capture bench-drift: $(VENV)/dev.stamp
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

@@ -31,6 +31,29 @@ class OrientedTree:
         _, index = self.tree.query(_joined(points, normals), workers=2)
         return np.asarray(index)
 
+    def pairs(
+        self, points: Array, normals: Array, *, max_distance_m: float, max_angle_rad: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Those of the oriented points (m, 3) that have a compatible neighbour, and which.
+
+        Farther points are not searched for, which is most of the time of `nearest`.
+        """
+        turn_m = 2.0 * _DIRECTION_SCALE_M * np.sin(0.5 * max_angle_rad)
+        reach_m = float(np.hypot(max_distance_m, turn_m))
+        _, index = self.tree.query(
+            _joined(points, normals), distance_upper_bound=reach_m, workers=2
+        )
+        found = np.flatnonzero(index < len(self.points))
+        index = index[found]
+        kept = compatible(
+            self.points[index] - points[found],
+            normals[found],
+            self.normals[index],
+            max_distance_m=max_distance_m,
+            max_angle_rad=max_angle_rad,
+        )
+        return found[kept], index[kept]
+
 
 def _joined(points: Array, normals: Array) -> Array:
     return np.concatenate([points, _DIRECTION_SCALE_M * normals], axis=1)

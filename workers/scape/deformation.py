@@ -19,6 +19,8 @@ Faces = NDArray[np.int32]
 
 _PINNED = 0
 """A Laplacian leaves the translation free: this vertex stays where the input has it."""
+_COLUMNS_AT_ONCE = 16
+"""More right-hand sides at once fall out of the processor's cache."""
 
 
 def triangle_areas(vertices: Array, faces: Faces) -> Array:
@@ -97,12 +99,13 @@ class EdgeSolver:
         """Solve L x = b for columns (P, m); every column of x is 0 at the pinned vertex."""
         b = np.ascontiguousarray(right_hand_side, dtype=np.float64)
         x = np.empty_like(b)
-        for start in range(0, b.shape[1], 96):
-            part = np.ascontiguousarray(b[:, start : start + 96])
+        for start in range(0, b.shape[1], _COLUMNS_AT_ONCE):
+            part = np.ascontiguousarray(b[:, start : start + _COLUMNS_AT_ONCE])
             solved = np.empty_like(part)
             self.solver.solve(part, solved)
-            x[:, start : start + 96] = solved
-        return np.asarray(x - x[_PINNED])
+            x[:, start : start + _COLUMNS_AT_ONCE] = solved
+        x -= x[_PINNED].copy()
+        return x
 
     def vertices(self, edges_: Array) -> Array:
         """Vertices (P, 3) whose edges come nearest to (K, 3, 3), with vertex 0 at the origin."""

@@ -16,9 +16,20 @@ from station.depth import PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
+from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
-from workers.scape.joint import COARSE, FINE, JointResult, Sampling, Target, fit_jointly
+from workers.scape.joint import (
+    COARSE,
+    FINE,
+    MIDDLE,
+    JointResult,
+    Sampling,
+    Target,
+    even_subset,
+    fit_jointly,
+)
 from workers.scape.model import BodyModel, BodyState
+from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
 from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
@@ -34,7 +45,7 @@ Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
-_PULLED_POINTS = 5000
+_TREE_POINTS = 60_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
@@ -75,6 +86,7 @@ def fit_body(
     *,
     method: Method = "joint",
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> FitResult:
     """Fit the model to a preprocessed scan.
 
@@ -84,42 +96,50 @@ def fit_body(
     _refuse_absurd(scan.cloud)
     # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _fit(model, scan, method, progress)
+        return _fit(model, scan, method, progress, observer)
 
 
-def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progress) -> FitResult:
+def _fit(
+    model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
+) -> FitResult:
     cloud = scan.cloud
+    observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
     scout, _ = sampling.stage(_SCOUT_SAMPLES)
-    pulled = _even_subset(len(cloud), _PULLED_POINTS)
-    target = Target(OrientedTree.build(cloud.points, cloud.normals), cloud.sigma_m, pulled)
-    starts = starting_states(model, scout, cloud.points[_even_subset(len(cloud), _COARSE_POINTS)])
+    target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
+    starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
+    if observer is not unobserved:
+        observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
-            model, target, starts[0], lambda share: progress("icp", share)
+            model, target, starts[0], lambda share: progress("icp", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
         fitted = finished = time.monotonic()
     else:
-        joint = _best_start(model, sampling, target, starts, progress)
+        joint = _best_start(model, sampling, cloud, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
+        observer("joint", {"vertices": joint.vertices})
         fitted = time.monotonic()
         progress("surface", 0.0)
-        surface = fit_surface(model, joint.vertices, target.tree, cloud.sigma_m)
+        surface = fit_surface(model, joint.vertices, cloud)
         finished = time.monotonic()
-    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, target.tree)
+    observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
+    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
     shifts = _camera_shifts(model, surface, cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
+    # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
+    # the same scan gives the same file.
+    delivered = np.round(surface.vertices, 7)
+    observer("done", {"vertices": delivered})
     progress("done", 1.0)
     return FitResult(
         state=state,
-        # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does
-        # not: the same scan gives the same file.
-        vertices=np.round(surface.vertices, 7),
+        vertices=delivered,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
@@ -141,23 +161,29 @@ def _fit(model: BodyModel, scan: Preprocessed, method: Method, progress: Progres
 def _best_start(
     model: BodyModel,
     sampling: Sampling,
+    cloud: PointCloud,
     target: Target,
     starts: Sequence[BodyState],
     progress: Progress,
+    observer: Observer,
 ) -> JointResult:
     """Fit from the best start; from others too while a limb's worth of points stays unexplained."""
     best, least = None, np.inf
     for start in starts[:_MOST_STARTS]:
-        coarse = fit_jointly(model, sampling, target, start, COARSE)
-        left = unexplained_share(model, coarse.vertices, target.tree)
+        coarse = fit_jointly(model, sampling, target, start, COARSE, observer=observer)
+        left = unexplained_share(model, coarse.vertices, cloud)
         if left < least:
             best, least = coarse, left
         if least < _EXPLAINED:
             break
     assert best is not None
-    return fit_jointly(
-        model, sampling, target, best.state, FINE, lambda share: progress("icp", share)
-    )
+    for schedule in (MIDDLE, FINE):
+        normals = vertex_normals(best.vertices, model.faces)
+        state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
+        best = fit_jointly(
+            model, sampling, target, state, schedule, lambda share: progress("icp", share), observer
+        )
+    return best
 
 
 def _refuse_absurd(cloud: PointCloud) -> None:
@@ -172,13 +198,6 @@ def _refuse_absurd(cloud: PointCloud) -> None:
         )
 
 
-def _even_subset(count: int, wanted: int) -> NDArray[np.intp]:
-    """The same pseudo-random subset for the same count: same input, same output."""
-    if count <= wanted:
-        return np.arange(count)
-    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
-
-
 def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> dict[str, float]:
     """The rigid shift (m) that would bring each camera's points onto the common surface."""
     normals = vertex_normals(surface.vertices, model.faces)
@@ -186,7 +205,7 @@ def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> 
     shifts = {}
     for index, name in enumerate(cloud.camera_names):
         mine = np.flatnonzero(cloud.camera == index)
-        mine = mine[_even_subset(len(mine), 10 * _CAMERA_POINTS)]
+        mine = mine[even_subset(len(mine), 10 * _CAMERA_POINTS)]
         if len(mine) < _CAMERA_POINTS:
             continue
         vertex = tree.nearest(cloud.points[mine], cloud.normals[mine])

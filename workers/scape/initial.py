@@ -7,9 +7,10 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from workers.scape.model import BodyModel, BodyState, SampledBody
+from workers.scape.kernels import trimmed_costs
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.sampled import SampledBody
 
 Array = NDArray[np.float64]
 
@@ -56,33 +57,46 @@ def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
     trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
     center = np.median(trunk if len(trunk) > 50 else points, axis=0)
-    tree = cKDTree(points)
+    # What bends the surface a little with the pose is left out here.
+    arms, _ = scout.arms(state, ())
 
-    def tried(arms: tuple[float, float], heading_deg: float) -> tuple[float, BodyState]:
-        turned = posed(model, state, arms, np.radians(heading_deg))
-        candidate = _placed(model, scout, turned, center)
-        return _cost(scout.evaluate(candidate), points, tree), candidate
+    def scored(tried: list[tuple[tuple[float, float], float]]) -> tuple[Array, list[BodyState]]:
+        states = [posed(model, state, angles, np.radians(heading)) for angles, heading in tried]
+        bodies, states = _placed(model, scout, arms, states, center)
+        return _costs(bodies, points), states
 
-    _, heading = min(
-        (tried((arm, arm), heading)[0], heading)
-        for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)
-    )
-    scored = [tried(arms, heading) for arms in product(_ARMS_DEG, _ARMS_DEG)]
-    scored.sort(key=lambda entry: entry[0])
-    return [candidate for _, candidate in scored]
+    together = [((arm, arm), heading) for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)]
+    _, heading = together[int(np.argmin(scored(together)[0]))]
+    costs, states = scored([(arms_deg, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)])
+    return [states[index] for index in np.argsort(costs, kind="stable")]
 
 
-def _placed(model: BodyModel, scout: SampledBody, state: BodyState, center: Array) -> BodyState:
-    """Over the cloud's center, soles on the floor."""
-    found = scout.evaluate(state)
+def _placed(
+    model: BodyModel,
+    scout: SampledBody,
+    arms: NDArray[np.float32],
+    states: list[BodyState],
+    center: Array,
+) -> tuple[Array, list[BodyState]]:
+    """Bodies (c, n, 3) over the cloud's center with their soles on the floor, and their states."""
+    rotations = np.stack([state.rotations for state in states])
+    bodies = np.einsum("cpij,npj->cni", rotations, arms.astype(np.float64), optimize=True)
     trunk = np.isin(model.part_of_vertex[scout.indices], (0, 1, 2))
-    shift = center - np.median(found[trunk], axis=0)
-    shift[2] = -found[:, 2].min()
-    return replace(state, translation=state.translation + shift)
+    shift = center - np.median(bodies[:, trunk], axis=1)
+    shift[:, 2] = -bodies[:, :, 2].min(axis=1)
+    placed = [
+        replace(state, translation=offset) for state, offset in zip(states, shift, strict=True)
+    ]
+    return bodies + shift[:, None], placed
 
 
-def _cost(body: Array, points: Array, tree: cKDTree) -> float:
-    """Trimmed two-way distance: the cloud must be explained, the body need not all be seen."""
-    to_cloud, _ = tree.query(body, distance_upper_bound=_TRIM_M)
-    to_body, _ = cKDTree(body).query(points, distance_upper_bound=2 * _TRIM_M)
-    return float(np.minimum(to_cloud, _TRIM_M).mean() + np.minimum(to_body, 2 * _TRIM_M).mean())
+def _costs(bodies: Array, points: Array) -> Array:
+    """Trimmed two-way distances: the cloud must be explained, the body need not all be seen."""
+    found = trimmed_costs(
+        np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
+        points.astype(np.float32),
+        2 * _TRIM_M,
+        _TRIM_M,
+        1.0,
+    )
+    return np.asarray(found)

@@ -7,7 +7,7 @@ share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,21 +15,25 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
-from workers.scape.correspondence import OrientedTree, compatible
+from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
-from workers.scape.model import BodyModel, BodyState, SampledBody, twist_chain
+from workers.scape.free_space import FreeSpace
+from workers.scape.hands import Hand, hands_of
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.observer import Observer, unobserved
+from workers.scape.rows import Rows, floor_rows, outline_rows
+from workers.scape.sampled import SampledBody, twist_chain
 
 Array = NDArray[np.float64]
 
 _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
-_ROW_SHARE = 0.12
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
-_FLOOR_SIGMA_M = 0.004
-_SOLE_BAND_M = 0.012
 _COARSE, _FINE = 600, 2000
+_PULLED_POINTS = 10_000
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -44,17 +48,18 @@ class Stage:
     angle_rad: float
     scale_m: float
     """Of the robust weight: residuals beyond it lose their pull."""
+    row_share: float
+    """What one row counts: neighbours share what the model cannot express. Low at first, so that
+    the prior carries the face and the hands as they are to where they belong."""
 
 
 COARSE = (
-    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060) for _ in range(4)),
-    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030) for _ in range(4)),
-    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018) for _ in range(3)),
+    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
+    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030, 0.06) for _ in range(4)),
+    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018, 0.06) for _ in range(3)),
 )
-FINE = (
-    *(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010) for _ in range(3)),
-    *(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006) for _ in range(2)),
-)
+MIDDLE = tuple(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010, 0.06) for _ in range(2))
+FINE = tuple(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006, 0.60) for _ in range(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,7 @@ class Sampling:
     body: SampledBody
     coarse_of_vertex: NDArray[np.intp]
     fine_of_vertex: NDArray[np.intp]
+    hands: tuple[Hand, ...]
 
     @classmethod
     def build(cls, model: BodyModel) -> Sampling:
@@ -73,13 +79,13 @@ class Sampling:
             model.at(order),
             cKDTree(model.mean[order[:_COARSE]]).query(model.mean)[1],
             cKDTree(model.mean[order]).query(model.mean)[1],
+            hands_of(model),
         )
 
     def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
         if count == _FINE:
             return self.body, self.fine_of_vertex
-        body = SampledBody(self.body.model, self.body.indices[:count], self.body.basis[:count])
-        return body, self.coarse_of_vertex
+        return self.body.first(count), self.coarse_of_vertex
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
@@ -100,12 +106,32 @@ def _spread(model: BodyModel) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The cloud as the fit uses it."""
+    """The cloud as the correspondences use it."""
 
     tree: OrientedTree
     sigma_m: Array
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
+    free_space: FreeSpace
+
+    @classmethod
+    def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
+        """An even subset of a cloud's points."""
+        used = even_subset(len(cloud), most_points)
+        tree = OrientedTree.build(cloud.points[used], cloud.normals[used])
+        return cls(
+            tree,
+            cloud.sigma_m[used],
+            even_subset(len(used), _PULLED_POINTS),
+            FreeSpace.build(views),
+        )
+
+
+def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
+    """The same pseudo-random subset for the same count: same input, same output."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +151,7 @@ def fit_jointly(
     state: BodyState,
     schedule: tuple[Stage, ...],
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
@@ -134,7 +161,7 @@ def fit_jointly(
         body, sample_of_vertex = sampling.stage(stage.samples)
         vertices = model.vertices(state)
         weight, pull, used = _data_terms(
-            model, target, vertices, stage, sample_of_vertex, len(body.indices)
+            model, target, vertices, stage, sample_of_vertex, len(body.indices), observer
         )
         state, information = _step(model, body, state, stage, weight, pull, prior)
         progress((step + 1) / len(schedule))
@@ -149,58 +176,35 @@ def _data_terms(
     stage: Stage,
     sample_of_vertex: NDArray[np.intp],
     samples: int,
+    observer: Observer,
 ) -> tuple[Array, Array, int]:
     """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3), and the number of rows."""
     normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
     pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
-    mine = OrientedTree.build(vertices, normals).nearest(
-        cloud.points[pulled], cloud.normals[pulled]
-    )
-    stride = max(1, len(vertices) // (2 * stage.samples))
-    asking = np.arange(0, len(vertices), stride)
-    found = cloud.nearest(vertices[asking], normals[asking])
-    vertex = np.concatenate([mine, asking])
-    point = np.concatenate([pulled, found])
+    limits = {"max_distance_m": stage.gate_m, "max_angle_rad": stage.angle_rad}
+    body = OrientedTree.build(vertices, normals)
+    asking, mine = body.pairs(cloud.points[pulled], cloud.normals[pulled], **limits)
+    probes = np.arange(0, len(vertices), max(1, len(vertices) // (2 * stage.samples)))
+    probing, found = cloud.pairs(vertices[probes], normals[probes], **limits)
+    vertex = np.concatenate([mine, probes[probing]])
+    point = np.concatenate([pulled[asking], found])
     offsets = cloud.points[point] - vertices[vertex]
-    kept = compatible(
-        offsets,
-        normals[vertex],
-        cloud.normals[point],
-        max_distance_m=stage.gate_m,
-        max_angle_rad=stage.angle_rad,
-    )
-    vertex, offsets = vertex[kept], offsets[kept]
+    on_body, on_cloud = vertices[vertex], cloud.points[point]
+    observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
     direction = normals[vertex]
     residual = np.einsum("ni,ni->n", direction, offsets)
-    variance = target.sigma_m[point[kept]] ** 2 + _MODEL_SIGMA_M**2
+    variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    row_weight = _ROW_SHARE * robust / variance
-    floor_vertex, floor_pull, floor_weight = _floor_rows(vertices, normals, stage)
-    vertex = np.concatenate([vertex, floor_vertex])
-    direction = np.concatenate([direction, np.tile((0.0, 0.0, 1.0), (len(floor_vertex), 1))])
-    residual = np.concatenate([residual, floor_pull])
-    row_weight = np.concatenate([row_weight, floor_weight])
-    sample = sample_of_vertex[vertex]
-    weight = np.zeros((samples, 9))
-    outer = (direction[:, :, None] * direction[:, None, :]).reshape(-1, 9)
-    for column in range(9):
-        weight[:, column] = np.bincount(sample, row_weight * outer[:, column], samples)
-    pull: Array = np.zeros((samples, 3))
-    for i in range(3):
-        pull[:, i] = np.bincount(sample, row_weight * residual * direction[:, i], samples)
-    return weight.reshape(-1, 3, 3), pull, len(residual)
-
-
-def _floor_rows(
-    vertices: Array, normals: Array, stage: Stage
-) -> tuple[NDArray[np.intp], Array, Array]:
-    """The soles stand on z = 0, which no camera sees; nothing lies below it."""
-    band = max(_SOLE_BAND_M, 0.5 * stage.gate_m)
-    down = (normals[:, 2] < -0.8) & (vertices[:, 2] < _SOLE_BAND_M)
-    touching = np.flatnonzero((down & (vertices[:, 2] > -band)) | (vertices[:, 2] < 0.0))
-    pull = -vertices[touching, 2]
-    return touching, pull, np.full(len(touching), 0.02 / _FLOOR_SIGMA_M**2)
+    row_weight = stage.row_share * robust / variance
+    rows = [
+        Rows(vertex, direction, residual, row_weight),
+        floor_rows(vertices, normals, 0.5 * stage.gate_m),
+    ]
+    if stage.samples != _COARSE:
+        rows.append(outline_rows(model, target.free_space, vertices, stage.row_share))
+    weight, pull = Rows.joined(*rows).at_samples(sample_of_vertex, samples)
+    return weight, pull, len(vertex)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,5 @@
-"""The one inner loop that numpy would pass over memory several times for: B, its value and its
-derivative at every sample, in one pass (numba; each sample alone, so threads change nothing)."""
+"""The one inner loop that numpy would pass over memory many times for: values and derivatives at
+every sample, in one pass (numba; each sample alone, so threads change nothing)."""
 
 from __future__ import annotations
 
@@ -10,35 +10,138 @@ import numpy as np
 numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]  # set at run time
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def value_and_derivative(  # type: ignore[no-untyped-def]  # pragma: no cover
-    basis, coefficients, rotations, shapes, all_shapes, parts_out, by_field
+@numba.njit(cache=True, fastmath=True)
+def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
+    starts,
+    parts,
+    mean,
+    shape,
+    twist_starts,
+    twist_parts,
+    twist_joints,
+    twist_blocks,
+    parents,
+    rotations,
+    beta,
+    twists,
+    positions,
+    derivative,
 ):
-    """Fill B_p(x) and dY/dx of some fields for every sample.
+    """Add what the blocks of every sample give to its position and derivative.
 
     Args:
-        basis: (n, L, 3, F) float32.
-        coefficients: (F,) float32.
+        starts: (n, 2) first and last + 1 of the sample's blocks.
+        parts: (m,) the part of a block.
+        mean: (m, 3) float32, B_p of the mean.
+        shape: (m, 3, B) float32, B_p of the components.
+        twist_starts, twist_parts, twist_joints, twist_blocks: (n, 2), (k,), (k,), (k, 3, 3), the
+            same for the relative twist of one joint.
+        parents: (L,).
         rotations: (L, 3, 3) float32.
-        shapes: how many shape fields are wanted, of all_shapes that there are.
-        parts_out: (n, L, 3) float32, out: B_p in the parts' own frames.
-        by_field: (n, 3, shapes + F - 1 - all_shapes) float32, out: shapes, then twists.
+        beta: (B',) float32, with B' >= the shapes that derivatives are wanted of.
+        twists: (L, 3) float32, relative.
+        positions: (n, 3) float64, in and out.
+        derivative: (n, 3, 3 L + shapes + 3) float32, in and out.
     """
-    count, parts, _, fields = basis.shape
-    twist_start = 1 + all_shapes
-    for v in numba.prange(count):
-        by_field[v] = 0.0
-        for p in range(parts):
-            for c in range(3):
-                row = basis[v, p, c]
-                total = np.float32(0.0)
-                for f in range(fields):
-                    total += row[f] * coefficients[f]
-                parts_out[v, p, c] = total
-                for i in range(3):
-                    turn = rotations[p, i, c]
-                    out = by_field[v, i]
-                    for f in range(shapes):
-                        out[f] += turn * row[1 + f]
-                    for f in range(fields - twist_start):
-                        out[shapes + f] += turn * row[twist_start + f]
+    count = len(starts)
+    first = 3 * len(rotations)
+    shapes = derivative.shape[2] - first - 3
+    for v in range(count):
+        out0, out1, out2 = derivative[v, 0], derivative[v, 1], derivative[v, 2]
+        field0, field1, field2 = out0[first:], out1[first:], out2[first:]
+        for block in range(starts[v, 0], starts[v, 1]):
+            part = parts[block]
+            turn = rotations[part]
+            r00, r01, r02 = turn[0, 0], turn[0, 1], turn[0, 2]
+            r10, r11, r12 = turn[1, 0], turn[1, 1], turn[1, 2]
+            r20, r21, r22 = turn[2, 0], turn[2, 1], turn[2, 2]
+            row0, row1, row2 = shape[block, 0], shape[block, 1], shape[block, 2]
+            x, y, z = mean[block, 0], mean[block, 1], mean[block, 2]
+            for j in range(shapes):
+                a, b, c = row0[j], row1[j], row2[j]
+                x += a * beta[j]
+                y += b * beta[j]
+                z += c * beta[j]
+                field0[j] += r00 * a + r01 * b + r02 * c
+                field1[j] += r10 * a + r11 * b + r12 * c
+                field2[j] += r20 * a + r21 * b + r22 * c
+            rest0, rest1, rest2, rest = row0[shapes:], row1[shapes:], row2[shapes:], beta[shapes:]
+            for j in range(len(rest)):
+                x += rest0[j] * rest[j]
+                y += rest1[j] * rest[j]
+                z += rest2[j] * rest[j]
+            _turn(positions[v], derivative[v], part, turn, x, y, z)
+        for block in range(twist_starts[v, 0], twist_starts[v, 1]):
+            part, joint = twist_parts[block], twist_joints[block]
+            turn, field = rotations[part], twist_blocks[block]
+            x, y, z = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for j in range(3):
+                x += field[0, j] * twists[joint, j]
+                y += field[1, j] * twists[joint, j]
+                z += field[2, j] * twists[joint, j]
+            _turn(positions[v], derivative[v], part, turn, x, y, z)
+            # The relative twist changes by back^T (turn of the joint's part - turn of its parent).
+            parent = parents[joint]
+            back = rotations[parent]
+            for i in range(3):
+                a = turn[i, 0] * field[0, 0] + turn[i, 1] * field[1, 0] + turn[i, 2] * field[2, 0]
+                b = turn[i, 0] * field[0, 1] + turn[i, 1] * field[1, 1] + turn[i, 2] * field[2, 1]
+                c = turn[i, 0] * field[0, 2] + turn[i, 1] * field[1, 2] + turn[i, 2] * field[2, 2]
+                for j in range(3):
+                    change = a * back[j, 0] + b * back[j, 1] + c * back[j, 2]
+                    derivative[v, i, 3 * joint + j] += change
+                    derivative[v, i, 3 * parent + j] -= change
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _turn(position, derivative, part, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Place a part's vector (x, y, z), turned, and how it changes with the part's turn."""
+    a = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+    b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+    c = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+    position[0] += a
+    position[1] += b
+    position[2] += c
+    column = 3 * part
+    derivative[0, column + 1] += c
+    derivative[0, column + 2] -= b
+    derivative[1, column] -= c
+    derivative[1, column + 2] += a
+    derivative[2, column] += b
+    derivative[2, column + 1] -= a
+
+
+@numba.njit(cache=True, fastmath=True)
+def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(h,): how badly each of h sets of points lies on a cloud, both ways.
+
+    Mean distance of the cloud's points to the nearest of the set, each at most cloud_cut, and
+    tried_share times the mean the other way round, each at most tried_cut.
+
+    Args:
+        tried: (h, k, n) float32: k coordinates of n points.
+        cloud: (m, k) float32.
+    """
+    tries, size, count = tried.shape
+    result = np.empty(tries)
+    square = np.empty(count, np.float32)
+    for h in range(tries):
+        back = np.full(count, np.float32(1e9))
+        total = 0.0
+        for p in range(len(cloud)):
+            square[:] = 0.0
+            for k in range(size):
+                here = cloud[p, k]
+                for s in range(count):
+                    difference = tried[h, k, s] - here
+                    square[s] += difference * difference
+            least = np.float32(1e9)
+            for s in range(count):
+                least = min(least, square[s])
+                back[s] = min(back[s], square[s])
+            total += min(np.sqrt(least), cloud_cut)
+        other = 0.0
+        for s in range(count):
+            other += min(np.sqrt(back[s]), tried_cut)
+        result[h] = total / len(cloud) + tried_share * other / count
+    return result

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from station.errors import FormatError
 from station.geometry import nearest_rotation, so3_exp, so3_log
-from workers.scape.cache import cached_array
 from workers.scape.deformation import EdgeSolver, Faces, edges, vertex_areas
-from workers.scape.kernels import value_and_derivative
+from workers.scape.sampled import SampledBody
 
 FORMAT = "booth-body-model"
 VERSIONS = frozenset({1})
@@ -114,6 +113,12 @@ class BodyModel:
         """(P,): weights of the pelvis' centroid, which the translation places."""
         weights = self.vertex_weights[:, 0] * vertex_areas(self.mean, self.faces)
         return np.asarray(weights / weights.sum())
+
+    @cached_property
+    def vertex_shares(self) -> Array:
+        """(P,): the area that each vertex stands for, 1 on average."""
+        areas = vertex_areas(self.mean, self.faces)
+        return np.asarray(areas / areas.mean())
 
     def part_laplacian(self, part: int) -> sp.csr_matrix:
         """L_p (P, P): the Laplacian with every triangle weighted by its share in the part."""
@@ -228,98 +233,7 @@ class BodyModel:
 
     def at(self, indices: NDArray[np.integer[Any]]) -> SampledBody:
         """The model at sample vertices (n,), with everything that derivatives need, cached."""
-        chosen = np.asarray(indices, dtype=np.int64)
-        key = hashlib.sha256(self.sha256.encode() + chosen.tobytes()).hexdigest()
-        basis = cached_array(f"basis-{key[:32]}", lambda: self._basis(chosen))
-        return SampledBody(self, chosen, basis)
-
-    def _basis(self, indices: NDArray[np.int64]) -> Array32:
-        """B (n, L, 3, 1 + B + 3 (L - 1)): by the adjoint solve, a column a sample."""
-        fields = np.concatenate([self.mean[None], self.directions, self.pose_fields])
-        columns = fields.transpose(1, 2, 0).reshape(self.vertex_count, -1)
-        unit = np.zeros((self.vertex_count, len(indices)))
-        unit[indices, np.arange(len(indices))] = 1.0
-        # Anchored: the value at a vertex less that at the pelvis' centroid.
-        unit -= self.anchor[:, None]
-        green = self.solver.solve(unit).T.astype(np.float32)
-        basis = np.empty((len(indices), self.part_count, 3, len(fields)), dtype=np.float32)
-        for part in range(self.part_count):
-            laplacian = self.part_laplacian(part)
-            rows = np.flatnonzero(np.diff(laplacian.indptr))
-            forces = (laplacian[rows] @ columns).astype(np.float32)
-            basis[:, part] = (green[:, rows] @ forces).reshape(len(indices), 3, -1)
-        return basis
-
-
-@dataclass(frozen=True, slots=True)
-class SampledBody:
-    """The model at n vertices: quick values and derivatives."""
-
-    model: BodyModel
-    indices: NDArray[np.int64]
-    basis: Array32
-    """(n, L, 3, F): B for the fields mean, U, C."""
-
-    def coefficients(self, state: BodyState) -> Array32:
-        """(F,): how much of each field a state has."""
-        twists = self.model.relative_twists(state.rotations)[1:].ravel()
-        return np.concatenate([[1.0], state.beta, twists]).astype(np.float32)
-
-    def evaluate(self, state: BodyState) -> Array:
-        """Positions (n, 3) in metres."""
-        parts = (self.basis @ self.coefficients(state)).astype(np.float64)
-        return np.asarray(np.einsum("pij,npj->ni", state.rotations, parts) + state.translation)
-
-    def jacobian(self, state: BodyState, shapes: int | None = None) -> tuple[Array, Array32]:
-        """Positions (n, 3) and derivatives (n, 3, D), D = 3 L + shapes + 3.
-
-        The parameters are delta (L, 3) with R_p <- so3_exp(delta_p) R_p, then the first `shapes`
-        of beta (all by default), then the translation. The pose-dependent fields follow the
-        twists' first-order change. Float32 moves no vertex by more than a hundredth of a
-        millimetre a step.
-        """
-        model = self.model
-        count, parts = len(self.indices), model.part_count
-        shapes = model.beta_count if shapes is None else min(shapes, model.beta_count)
-        twists = 3 * (parts - 1)
-        local = np.empty((count, parts, 3), np.float32)
-        by_field = np.empty((count, 3, shapes + twists), np.float32)
-        value_and_derivative(
-            self.basis,
-            self.coefficients(state),
-            state.rotations.astype(np.float32),
-            shapes,
-            model.beta_count,
-            local,
-            by_field,
-        )
-        arms = np.einsum("pij,npj->npi", state.rotations, local.astype(np.float64))
-        positions = arms.sum(axis=1) + state.translation
-        derivative = np.zeros((count, 3, 3 * parts + shapes + 3), np.float32)
-        turning = derivative[:, :, : 3 * parts].reshape(count, 3, parts, 3)
-        for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-            turning[:, i, :, j] = arms[:, :, k]
-            turning[:, i, :, k] = -arms[:, :, j]
-        chain = twist_chain(model, state.rotations).astype(np.float32)
-        turned = by_field[:, :, shapes:].reshape(-1, twists) @ chain
-        derivative[:, :, : 3 * parts] = turning.reshape(count, 3, -1)
-        derivative[:, :, : 3 * parts] += turned.reshape(count, 3, -1)
-        derivative[:, :, 3 * parts : -3] = by_field[:, :, :shapes]
-        derivative[:, :, -3:] = np.eye(3, dtype=np.float32)
-        return positions, derivative
-
-
-def twist_chain(model: BodyModel, rotations: Array) -> Array:
-    """First-order change of the relative twists (3 (L - 1), 3 L) with the parts' turns."""
-    parts = model.part_count
-    change = np.zeros((3 * (parts - 1), 3 * parts))
-    for part, parent in enumerate(model.part_parents):
-        if parent >= 0:
-            back = rotations[parent].T
-            row = slice(3 * (part - 1), 3 * part)
-            change[row, 3 * part : 3 * part + 3] = back
-            change[row, 3 * parent : 3 * parent + 3] = -back
-    return change
+        return SampledBody.build(self, indices)
 
 
 def save_model(path: Path, fields: dict[str, Any], metadata: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from workers.scape.correspondence import compatible
 from workers.scape.deformation import vertex_normals
 from workers.scape.joint import Target
 from workers.scape.model import BodyModel, BodyState
+from workers.scape.observer import Observer, unobserved
 from workers.scape.surface import SurfaceFit
 
 Array = NDArray[np.float64]
@@ -40,12 +41,15 @@ def fit_like_the_paper(
     target: Target,
     state: BodyState,
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> tuple[SurfaceFit, BodyState, int]:
     """The paper's loop; returns the surface, the last state and how often it went round."""
     mesh = model.vertices(state)
     iteration = 0
     for iteration in range(1, _MOST_ITERATIONS + 1):
         mesh, pairs = align_rigidly(model, target, mesh)
+        on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
+        observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
         state = solve_pose_and_shape(model, mesh, pairs, target)
         moved = solve_mesh(model.vertices(state), pairs, target)
         change_m = float(np.sqrt(np.mean(np.sum((moved - mesh) ** 2, axis=1))))

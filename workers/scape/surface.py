@@ -10,13 +10,15 @@ is smooth and fades over what no camera saw. Conjugate gradients from the last r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import cg
 
-from workers.scape.correspondence import OrientedTree, compatible
+from station.depth import PointCloud
+from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
 from workers.scape.model import BodyModel
 
@@ -24,12 +26,12 @@ Array = NDArray[np.float64]
 
 _ROUNDS = (
     # gate, angle, stiffness
-    (0.030, np.radians(50), 30.0),
-    (0.020, np.radians(45), 6.0),
-    (0.012, np.radians(40), 1.5),
+    (0.030, np.radians(50), 240.0),
+    (0.020, np.radians(45), 48.0),
+    (0.012, np.radians(40), 12.0),
 )
 _SIGMA_OF_STIFFNESS_M = 0.001
-_FADE = 2e-4
+_FADE = 2.5e-5
 """A weak pull towards the model, so that a field cannot drift where there are no data."""
 _INDEPENDENT = 0.25
 """Share of a vertex' readings that count as independent: matching windows overlap."""
@@ -53,13 +55,11 @@ class SurfaceFit:
     """(P,): mean signed distance of its points after the fit; NaN where there are none."""
 
 
-def fit_surface(
-    model: BodyModel, vertices: Array, cloud: OrientedTree, sigma_m: Array
-) -> SurfaceFit:
+def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    points, directions, noise = cloud.points[every], cloud.normals[every], sigma_m[every]
-    laplacian = model.solver.laplacian
+    points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
+    laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
     weight = np.zeros(len(vertices))
@@ -84,6 +84,16 @@ def fit_surface(
     )
 
 
+@lru_cache(maxsize=2)
+def _membrane(model: BodyModel) -> sp.csr_matrix:
+    """L (P, P), the graph's: in two dimensions a membrane is as stiff in small triangles as in
+    large ones, so that ears and lips do not follow noise."""
+    pattern = abs(model.solver.laplacian).sign()
+    pattern = pattern - sp.diags(pattern.diagonal())
+    degree = np.asarray(pattern.sum(axis=1)).ravel()
+    return (sp.diags(degree) - pattern).tocsr()
+
+
 def _gathered(
     vertices: Array,
     normals: Array,
@@ -94,18 +104,11 @@ def _gathered(
     angle_rad: float,
 ) -> tuple[Array, Array]:
     """Each vertex' mean distance (P,) to its points along the normal, and its information."""
-    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
-    offsets = points - vertices[vertex]
-    kept = compatible(
-        offsets,
-        normals[vertex],
-        directions,
-        max_distance_m=gate_m,
-        max_angle_rad=angle_rad,
+    used, vertex = OrientedTree.build(vertices, normals).pairs(
+        points, directions, max_distance_m=gate_m, max_angle_rad=angle_rad
     )
-    vertex, offsets = vertex[kept], offsets[kept]
-    distance = np.einsum("ni,ni->n", normals[vertex], offsets)
-    information = _INDEPENDENT / np.maximum(sigma_m[kept], _LEAST_SIGMA_M) ** 2
+    distance = np.einsum("ni,ni->n", normals[vertex], points[used] - vertices[vertex])
+    information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
     weight: Array = np.bincount(vertex, information, count).astype(np.float64)
     total: Array = np.bincount(vertex, information * distance, count).astype(np.float64)

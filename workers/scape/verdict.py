@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.depth import Finding
+from station.depth import Finding, PointCloud
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.model import BodyModel
@@ -51,7 +51,7 @@ class Verdict:
 
 
 def report_parts(
-    model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: OrientedTree
+    model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: PointCloud
 ) -> tuple[tuple[PartReport, ...], float, float]:
     """Reports by part, the point-to-surface rms in metres and the share of unexplained points."""
     areas = vertex_areas(vertices, model.faces)
@@ -84,7 +84,7 @@ def _unmet(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
     return lost / int(np.count_nonzero(around))
 
 
-def unexplained_share(model: BodyModel, vertices: Array, cloud: OrientedTree) -> float:
+def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> float:
     """Share of the points farther than 3 cm from the body's surface: a lost limb, a second body."""
     points, directions = _thinned(cloud, 5000)
     normals = vertex_normals(vertices, model.faces)
@@ -93,7 +93,7 @@ def unexplained_share(model: BodyModel, vertices: Array, cloud: OrientedTree) ->
     return float(np.mean(away > _UNEXPLAINED_M))
 
 
-def _thinned(cloud: OrientedTree, count: int) -> tuple[Array, Array]:
+def _thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
     every = slice(None, None, max(1, len(cloud.points) // count))
     return cloud.points[every], cloud.normals[every]
 

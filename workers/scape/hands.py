@@ -1,0 +1,197 @@
+"""Hands: small, thin and quick to turn, so that descending from one guess loses every third.
+
+A cross-entropy search (Rubinstein 1999) over the twists of hand, thumb and fingers, from their
+prior, against the points beyond the wrist; everything else of the body stays where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.geometry import so3_exp
+from workers.scape.correspondence import OrientedTree
+from workers.scape.kernels import trimmed_costs
+from workers.scape.model import BodyModel, BodyState
+from workers.scape.sampled import SampledBody
+
+Array = NDArray[np.float64]
+
+_SAMPLES = 130
+_POINTS = 260
+_LEAST_POINTS = 25
+_REACH_M = 0.23
+_BEHIND_WRIST_M = 0.015
+_FOREIGN_M = 0.025
+_CUT_M = 0.03
+_DIRECTION_SCALE_M = 0.02
+_MODEL_SHARE = 0.5
+_PRIOR_M = 2.5e-4
+"""What one squared standard deviation off the prior costs, in metres of mean distance."""
+_ROUNDS = (96, 64, 48, 32)
+_ELITE = 8
+_SPREAD = 1.25
+"""Standard deviations of the prior that the first round spans."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hand:
+    """What the search needs of one side's hand."""
+
+    side: str
+    body: SampledBody
+    parts: tuple[int, ...]
+    """hand, thumb, fingers; every one after its parent."""
+    forearm: int
+    owner: NDArray[np.int32]
+    """(n,): the part of each sample."""
+    mean: Array
+    """(9,): prior twists of the parts, radians."""
+    spread: Array
+    """(9, 9): a square root of their covariance."""
+
+
+def hands_of(model: BodyModel) -> tuple[Hand, ...]:
+    """Both hands, their samples spread evenly."""
+    return tuple(_hand(model, side) for side in ("left", "right"))
+
+
+def _hand(model: BodyModel, side: str) -> Hand:
+    names = model.part_names
+    parts = tuple(names.index(f"{part}_{side}") for part in ("hand", "thumb", "fingers"))
+    mine = np.flatnonzero(np.isin(model.part_of_vertex, parts))
+    order = _spread_out(model.mean[mine], _SAMPLES)
+    columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])
+    values, vectors = np.linalg.eigh(model.twist_covariance[np.ix_(columns, columns)])
+    body = model.at(mine[order])
+    return Hand(
+        side=side,
+        body=body,
+        parts=parts,
+        forearm=names.index(f"forearm_{side}"),
+        owner=model.part_of_vertex[body.indices],
+        mean=model.twist_mean[columns],
+        spread=vectors * np.sqrt(np.maximum(values, 0.0)),
+    )
+
+
+def _spread_out(points: Array, count: int) -> NDArray[np.intp]:
+    """Farthest-point order."""
+    chosen = np.zeros(count, np.intp)
+    distance = np.linalg.norm(points - points[0], axis=1)
+    for index in range(1, count):
+        chosen[index] = np.argmax(distance)
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[index]], axis=1))
+    return chosen
+
+
+def place_hands(
+    model: BodyModel,
+    hands: tuple[Hand, ...],
+    cloud: OrientedTree,
+    state: BodyState,
+    vertices: Array,
+    normals: Array,
+) -> BodyState:
+    """The state with both hands turned and closed as the points beyond the wrists say."""
+    tree = OrientedTree.build(vertices, normals)
+    for hand in hands:
+        points, directions = _beyond_wrist(model, hand, cloud, vertices, tree)
+        if len(points) >= _LEAST_POINTS:
+            state = _searched(model, hand, state, normals, points, directions)
+    return state
+
+
+def _beyond_wrist(
+    model: BodyModel, hand: Hand, cloud: OrientedTree, vertices: Array, tree: OrientedTree
+) -> tuple[Array, Array]:
+    """Oriented points (n, 3) that can be the hand's: near it, and not the thigh's."""
+    weights = model.vertex_weights
+    ring = weights[:, hand.forearm] * weights[:, hand.parts[0]]
+    wrist = ring @ vertices / ring.sum()
+    elbow_side = weights[:, hand.forearm] @ vertices / weights[:, hand.forearm].sum()
+    along = (wrist - elbow_side) / np.linalg.norm(wrist - elbow_side)
+    offsets = cloud.points - wrist
+    near = np.flatnonzero(
+        (offsets @ along > -_BEHIND_WRIST_M)
+        & (np.einsum("ni,ni->n", offsets, offsets) < _REACH_M**2)
+    )
+    near = near[:: max(1, len(near) // _POINTS)]
+    points, directions = cloud.points[near], cloud.normals[near]
+    vertex = tree.nearest(points, directions)
+    own = np.isin(model.part_of_vertex[vertex], (*hand.parts, hand.forearm))
+    away = np.linalg.norm(points - vertices[vertex], axis=1)
+    kept = own | (away > _FOREIGN_M)
+    return points[kept], directions[kept]
+
+
+def _searched(
+    model: BodyModel,
+    hand: Hand,
+    state: BodyState,
+    normals: Array,
+    points: Array,
+    directions: Array,
+) -> BodyState:
+    start = model.relative_twists(state.rotations)[list(hand.parts)].ravel()
+    # Standard coordinates: the prior is N(0, I) in them.
+    inverse = np.linalg.pinv(hand.spread, rcond=1e-3)
+    found = inverse @ (start - hand.mean)
+    local = normals[hand.body.indices]
+    cloud = np.concatenate([points, _DIRECTION_SCALE_M * directions], axis=1).astype(np.float32)
+    rng = np.random.default_rng(0)
+    center, width = np.zeros(len(found)), np.full(len(found), _SPREAD)
+    best, least = found, np.inf
+    for count in _ROUNDS:
+        tried = center + width * rng.standard_normal((count, len(found)))
+        tried[0] = best
+        twists = hand.mean + tried @ hand.spread.T
+        samples = _posed(model, hand, state, twists, local)
+        cost = trimmed_costs(samples, cloud, _CUT_M, _CUT_M, _MODEL_SHARE)
+        cost = cost + _PRIOR_M * np.sum(tried**2, axis=1)
+        order = np.argsort(cost, kind="stable")
+        if cost[order[0]] < least:
+            best, least = tried[order[0]], float(cost[order[0]])
+        elite = tried[order[:_ELITE]]
+        center, width = elite.mean(axis=0), elite.std(axis=0) + 0.02
+    rotations = _rotations(model, hand, state, (hand.mean + hand.spread @ best)[None])
+    turned = state.rotations.copy()
+    turned[list(hand.parts)] = rotations[0]
+    return replace(state, rotations=turned)
+
+
+def _rotations(model: BodyModel, hand: Hand, state: BodyState, twists: Array) -> Array:
+    """(h, 3, 3, 3): absolute rotations of the hand's parts for twists (h, 9)."""
+    relative = so3_exp(twists.reshape(-1, 3, 3))
+    found = np.empty_like(relative)
+    for index, part in enumerate(hand.parts):
+        parent = int(model.part_parents[part])
+        base = (
+            found[:, hand.parts.index(parent)]
+            if parent in hand.parts
+            else state.rotations[parent][None]
+        )
+        found[:, index] = base @ relative[:, index]
+    return found
+
+
+def _posed(
+    model: BodyModel, hand: Hand, state: BodyState, twists: Array, normals: Array
+) -> NDArray[np.float32]:
+    """(h, 6, n): the samples and their scaled normals for twists (h, 9)."""
+    body, parts = hand.body, list(hand.parts)
+    count, tries = len(body.indices), len(twists)
+    now = model.relative_twists(state.rotations)[parts].ravel()
+    still, change = body.arms(state, parts)
+    carried = still.ravel()[:, None] + change.reshape(still.size, -1) @ (twists - now).T
+    rotations = np.broadcast_to(state.rotations, (tries, *state.rotations.shape)).copy()
+    rotations[:, parts] = _rotations(model, hand, state, twists)
+    turning = np.swapaxes(rotations, 2, 3).reshape(tries, -1, 3).astype(np.float32)
+    arms = carried.T.astype(np.float32).reshape(tries, count, -1)
+    positions = arms @ turning + state.translation.astype(np.float32)
+    turns = rotations[:, hand.owner] @ np.swapaxes(state.rotations[hand.owner], 1, 2)
+    turned = np.einsum("hnij,nj->hni", turns, normals)
+    joined = np.concatenate([positions, _DIRECTION_SCALE_M * turned], axis=2)
+    return np.ascontiguousarray(joined.swapaxes(1, 2), np.float32)
