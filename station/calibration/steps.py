@@ -16,7 +16,7 @@ from station.calibration.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide import Guide
 from station.calibration.planes import observe_floor, observe_wall
 from station.calibration.rig import CameraCalibration
-from station.calibration.scene import Image, static_view
+from station.calibration.scene import Image, smoothed, static_view
 from station.calibration.session import Session
 from station.errors import CalibrationError
 
@@ -29,7 +29,7 @@ _RESTING_M = 0.006
 _KEEP_EVERY_S = 1.0
 _DETECTORS = 2
 _OFTEN = 0.9
-_MOVED_PER_M, _MOVED_SHARE = 0.03, 0.002
+_MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
 
 
@@ -100,7 +100,8 @@ def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
     before = static_view((frame.depth for frame in frames[:half]), scale_m)
     after = static_view((frame.depth for frame in frames[half:]), scale_m)
     both = (before.share > _OFTEN) & (after.share > _OFTEN)
-    change = np.abs(before.inverse_depth - after.inverse_depth)[both]
+    surface, surface_after = (smoothed(v.inverse_depth, v.share)[0] for v in (before, after))
+    change = np.abs(surface - surface_after)[both]
     if float(np.mean(change > _MOVED_PER_M)) > _MOVED_SHARE:
         raise CalibrationError(
             f"something moved in front of camera {name}; leave the booth and do it again"
