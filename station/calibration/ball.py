@@ -113,7 +113,7 @@ def _candidates(
     if len(rows) < 4 or len(columns) < 4:
         return []
     part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    votes, distance = _votes(inverse[part], foreground[part], rays(camera)[part], radius_m)
+    votes = _votes(inverse[part], foreground[part], rays(camera)[part], radius_m)
     if len(votes) < 20:
         return []
     low = votes.min(axis=0) - _CELL_M
@@ -124,7 +124,7 @@ def _candidates(
     close, around = (
         size**3 * ndimage.uniform_filter(grid, size, mode="constant") for size in (3, 7)
     )
-    # A wall's votes lie on a plane and an arm's on a line: their surroundings are full of votes, too.
+    # A wall's votes lie on a plane and an arm's on a line: there are votes around each, too.
     # What is near covers more pixels: votes count as a share of what a ball there would give.
     depths = np.maximum(low[2] + (np.arange(shape[2]) + 0.5) * _CELL_M, 0.3).astype(np.float32)
     alone = close - _AROUND_WEIGHT * around
@@ -147,17 +147,15 @@ def _candidates(
     return found
 
 
-def _votes(
-    inverse: Image, foreground: Mask, ray: Image, radius_m: float
-) -> tuple[Array, NDArray[np.float32]]:
-    """Ball centres (n, 3) that single pixels speak for, and their distances."""
+def _votes(inverse: Image, foreground: Mask, ray: Image, radius_m: float) -> Array:
+    """Ball centres (n, 3) that single pixels speak for."""
     mask = foreground.astype(np.float32)
     share = cv2.blur(mask, (_BLUR_PX, _BLUR_PX), borderType=cv2.BORDER_CONSTANT)
     blurred = cv2.blur(inverse * mask, (_BLUR_PX, _BLUR_PX), borderType=cv2.BORDER_CONSTANT)
     smooth = np.where(share > 0.5, blurred / np.maximum(share, 1e-6), 0.0)
     r = _SLOPE_PX
     if min(smooth.shape) <= 2 * r:
-        return np.empty((0, 3)), np.empty(0, np.float32)
+        return np.empty((0, 3))
     inner = np.s_[r:-r:_STEP_PX, r:-r:_STEP_PX]
     middle, rays_ = smooth[inner], ray[inner]
     right, left = smooth[r:-r, 2 * r :], smooth[r:-r, : -2 * r]
@@ -183,7 +181,7 @@ def _votes(
     )
     depth = 1.0 / middle[good]
     points = rays_[good] * depth[:, None] + radius_m * m[good] / length[good][:, None]
-    return points.astype(np.float64), depth
+    return np.asarray(points, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,7 +418,10 @@ def _patches(
     residual = mean(away[good])
     x, y = _bilinear(ray, middle_u, middle_v)
     at_middle = np.array(
-        [_predict(xi, yi, *center, radius)[0] for xi, yi in zip(x, y, strict=True)]
+        [
+            _predict(xi, yi, center[0], center[1], center[2], radius)[0]
+            for xi, yi in zip(x, y, strict=True)
+        ]
     )
     variance = mean(SQUARE_ERROR / cosine[good] + ROUNDING) / size[kept]
     patches = np.stack(

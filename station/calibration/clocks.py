@@ -41,7 +41,7 @@ class ClockJump:
 def large_jump(
     tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pair]
 ) -> ClockJump | None:
-    """A jump that is seen as pairs that agree for a time only, and again once a clock is shifted."""
+    """A jump that shows as a pair that agrees for a time, and again once a clock is shifted."""
     votes: dict[str, list[ClockJump]] = {}
     shifts = np.arange(-_LONGEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
     for (a, b), pair in pairs.items():
@@ -104,7 +104,7 @@ def _offsets(name: str, problem: Problem, state: State) -> tuple[Array, Array, A
     sums = np.bincount(window[good], pulled[good], minlength=window.max() + 1)
     kept = (count >= _LEAST_IN_WINDOW) & (total > 0)
     starts = seen.times_s[0] + _WINDOW_S * np.flatnonzero(kept)
-    return starts, sums[kept] / total[kept], 2.0 * total[kept] ** -0.5
+    return starts, sums[kept] / total[kept], np.asarray(2.0 * total[kept] ** -0.5)
 
 
 def _agreement(

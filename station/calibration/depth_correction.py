@@ -1,8 +1,8 @@
 """A camera's depth error as the calibration solves for it: linear in inverse depth.
 
 1/z_true = w + p0 + p1 w + p2 (w - w0)^2 + p3 x + p4 y, with w = 1/z_measured and x, y from -1 to 1
-over the image. Its first term is a shift of the disparity (the sensor's reference plane), the second
-a wrong baseline or focal length, p3 and p4 a projector that is turned against its camera.
+over the image. Its first term is a shift of the disparity (the sensor's reference plane), the
+second a wrong baseline or focal length, p3 and p4 a projector that is turned against its camera.
 
 Shift and gradient are collineations: they take planes to planes and, in all cameras together, a
 whole booth to one that looks as consistent. What tells them apart are the ball's known radius and

@@ -106,7 +106,7 @@ class Surface:
     @property
     def plane(self) -> Array:
         """m (3,) of 1/z = m . (x, y, 1) without correction."""
-        return np.linalg.solve(self.normal[:3, :3], -self.pull[:3])
+        return np.asarray(np.linalg.solve(self.normal[:3, :3], -self.pull[:3]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +239,7 @@ def solve_joint(problem: Problem, start: State) -> State:
     scale = equations.scale()
     return replace(
         state,
-        covariance=np.linalg.inv(equations.schur()) * scale**2,
+        covariance=np.asarray(np.linalg.inv(equations.schur()) * scale**2),
         deviations=equations.deviations,
         scale=scale,
     )
@@ -272,7 +272,7 @@ class _Equations:
         """Steps of the border (m,) and of the path (count, 3)."""
         schur = self.schur()
         pull = self._border_pull - self._coupling @ self._band_solve(self._path_pull)
-        step = -np.linalg.solve(schur, pull)
+        step = np.asarray(-np.linalg.solve(schur, pull))
         path = -self._band_solve(self._path_pull + self._coupling.T @ step)
         return step, path.reshape(-1, 3)
 

@@ -134,7 +134,8 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
         return None
     for _ in range(4):
         on_plane = np.abs(ray @ best - inverse) < gate
-        best = np.linalg.lstsq(ray[on_plane], inverse[on_plane], rcond=None)[0]
+        fitted = np.linalg.lstsq(ray[on_plane], inverse[on_plane], rcond=None)[0]
+        best = np.asarray(fitted, np.float64)
     return best
 
 

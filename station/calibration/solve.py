@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration import acceptance, clocks, world
 from station.calibration.acceptance import HeldOut
-from station.calibration.coverage import LEAST_DETECTIONS, Coverage, coverage
+from station.calibration.coverage import Coverage
 from station.calibration.depth_correction import correction_of
 from station.calibration.detections import FLOOR, BallDetection, Observations
 from station.calibration.initial import (
@@ -35,6 +36,7 @@ Progress = Callable[[str], None]
 
 _RADIUS_SHARE = 0.04
 """How far the measured radius may lie from the given one; a depth error of 1 % moves it by 1 %."""
+_LEAST_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
 _LARGEST_SIGMA_M = 0.002
 _LARGEST_SIGMA_RAD = np.radians(0.1)
@@ -50,13 +52,52 @@ class Solution:
     placed: Placed
     """Poses with the covariance between cameras."""
     held_out: Mapping[str, HeldOut]
-    coverage: Coverage
     weak: tuple[str, ...]
     """What could be better, and how; empty where nothing need be."""
     clock_s: Mapping[str, float]
     """Offset of each camera's clock against the reference's."""
     radius_m: float
     """The ball's, as all cameras measured it."""
+
+    def summary(self) -> list[str]:
+        """What the operator is told."""
+        rms_mm = 1e3 * self.rig.residual_rms_m
+        lines = [f"tested on every fifth second: {rms_mm:.1f} mm rms between cameras"]
+        for name, one in self.held_out.items():
+            shift_m, turn_rad = self._sigma(name)
+            known = (
+                "reference"
+                if name == self.rig.reference
+                else f"known to {1e3 * shift_m:.1f} mm and {np.degrees(turn_rad):.2f} degrees"
+            )
+            off_mm = 1e3 * float(np.linalg.norm(one.mean_m))
+            lines.append(f"{name}: {known}; off by {off_mm:.1f} mm in {one.detections} tests")
+        return lines + [f"could be better: {words}" for words in self.weak]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """For a JSON file beside the calibration."""
+        names = list(self.placed.world_from_camera)
+        return {
+            "residual_rms_m": self.rig.residual_rms_m,
+            "measured_radius_m": self.radius_m,
+            "weak": list(self.weak),
+            "cameras": {
+                name: {
+                    "held_out": self.held_out[name].detections,
+                    "held_out_rms_m": self.held_out[name].rms_m,
+                    "held_out_mean_m": self.held_out[name].mean_m.tolist(),
+                    "sigma_to_reference_m": self._sigma(name)[0],
+                    "sigma_to_reference_rad": self._sigma(name)[1],
+                    "clock_offset_s": self.clock_s[name],
+                }
+                for name in names
+            },
+            "joint_covariance": {"cameras": names, "xi": self.placed.covariance.tolist()},
+        }
+
+    def _sigma(self, name: str) -> tuple[float, float]:
+        return _sigma_to(self.placed, self.rig.reference, name)
 
 
 def solve(
@@ -79,7 +120,9 @@ def solve(
         CalibrationError: naming the camera or the step that spoils it, and what to do.
     """
     progress("checking what was seen")
-    covered = coverage(observations.balls, cameras)
+    covered = Coverage(cameras, reference)
+    for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
+        covered.add(ball)
     _check_counts(covered)
     measured_m = _check_radius(observations.balls, radius_m)
     detections = sorted_detections(observations.balls, list(cameras), radius_m)
@@ -109,7 +152,8 @@ def solve(
     _check_sigma(placed, reference, covered)
     _check_mark(placed, radius_m)
     rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
-    return Solution(rig, placed, found, covered, tuple(covered.advice()), state.clock_s, measured_m)
+    weak = () if covered.enough else (covered.advice(),)
+    return Solution(rig, placed, found, weak, state.clock_s, measured_m)
 
 
 def _problem(
@@ -169,12 +213,12 @@ def _rig(
 
 
 def _check_counts(covered: Coverage) -> None:
-    for name, seen in covered.cameras.items():
-        if seen.detections < LEAST_DETECTIONS:
+    for name, count in covered.counts().items():
+        if count < _LEAST_DETECTIONS:
             raise CalibrationError(
-                f"camera {name} saw the ball in {seen.detections} frames only "
-                f"({LEAST_DETECTIONS} are needed): check that the camera works and is not covered, "
-                f"and wave the ball where {name} looks"
+                f"camera {name} saw the ball in {count} frames only ({_LEAST_DETECTIONS} are "
+                f"needed): check that the camera works and is not covered, and wave the ball "
+                f"where {name} looks"
             )
 
 
@@ -255,18 +299,25 @@ def _check_held_out(found: Mapping[str, HeldOut]) -> None:
             )
 
 
+def _sigma_to(placed: Placed, reference: str, name: str) -> tuple[float, float]:
+    """Largest standard deviations of a camera's place (m) and turn (rad) from the reference's."""
+    if name == reference:
+        return 0.0, 0.0
+    _, covariance = world.relative(placed, reference, name)
+    return (
+        float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
+        float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+    )
+
+
 def _check_sigma(placed: Placed, reference: str, covered: Coverage) -> None:
     for name in placed.world_from_camera:
-        if name == reference:
-            continue
-        _, covariance = world.relative(placed, reference, name)
-        shift = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-        turn = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        shift, turn = _sigma_to(placed, reference, name)
         if shift > _LARGEST_SIGMA_M or turn > _LARGEST_SIGMA_RAD:
-            missing = ", ".join(covered.cameras[name].missing()[:3]) or "its whole image"
+            more = "" if covered.enough else f"; {covered.advice()}"
             raise CalibrationError(
-                f"camera {name} is known to {1e3 * shift:.1f} mm and {np.degrees(turn):.2f} degrees "
-                f"only: wave the ball longer, where {name} sees it {missing}, near and far"
+                f"camera {name} is known to {1e3 * shift:.1f} mm and {np.degrees(turn):.2f} "
+                f"degrees only: wave the ball longer, near to {name} and far from it{more}"
             )
 
 

@@ -1,7 +1,8 @@
 """The ball's way through the booth as a uniform cubic B-spline in time.
 
-Cameras run free, so no two see the ball at one moment. A continuous path (Furgale, Barfoot & Sibley
-2012) lets each frame speak for its own time, and a camera's clock offset is a parameter like others.
+Cameras run free, so no two see the ball at one moment. A continuous path (Furgale, Barfoot &
+Sibley 2012) lets each frame speak for its own time, and a camera's clock offset is a parameter like
+others.
 """
 
 from __future__ import annotations

@@ -174,6 +174,6 @@ class _Waving:
         hip = trunk.copy()
         hip[2] = 0.15
         parts.append(Capsule(hip, trunk - (0.0, 0.0, 0.1), 0.15))
-        chin = trunk + (0.0, 0.0, 0.22)
-        parts.append(Capsule(chin, chin + (0.0, 0.0, 0.07), 0.08))
+        chin = trunk + np.array([0.0, 0.0, 0.22])
+        parts.append(Capsule(chin, chin + np.array([0.0, 0.0, 0.07]), 0.08))
         return parts

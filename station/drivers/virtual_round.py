@@ -88,7 +88,7 @@ def _bounds(shapes: Array, camera: CameraCalibration) -> NDArray[np.int64]:
         u, v = K[0, 0] * end[:, 0] / depth + K[0, 2], K[1, 1] * end[:, 1] / depth + K[1, 2]
         near = np.maximum(depth - shapes[:, 6], 0.2)
         reach = 1.1 * K[0, 0] * shapes[:, 6] / near + _MARGIN_PX
-        # The projector stands to the camera's right, so shadows fall to the left of what casts them.
+        # The projector stands to the camera's right: shadows fall to the left of what casts them.
         shadow = K[0, 0] * BASELINE_M / near
         sides.append(np.stack([u - reach - shadow, v - reach, u + reach, v + reach], axis=1))
     low = np.minimum(sides[0], sides[1])[:, :2]
