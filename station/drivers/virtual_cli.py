@@ -21,6 +21,7 @@ _UNIT_BIAS_M = 0.010
 _STRIDE = {BALL: 3}
 _OTHER_STRIDE = 2
 """Of a calibration every second or third frame is kept: who looks is slower than the sensors."""
+_BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 
 
@@ -75,7 +76,7 @@ def record_virtual(
         for name in booth.rig.cameras
     }
     if waving_s is not None:
-        procedure = VirtualProcedure(booth, waving_s=waving_s)
+        procedure = VirtualProcedure(booth, waving_s=waving_s, board_at_m=_BOARD_AT_M)
         for step in procedure.steps:
             for name in booth.rig.cameras:
                 folder = out_folder / PROCEDURE / step / name
