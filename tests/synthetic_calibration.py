@@ -6,7 +6,8 @@ with the sensor's noise; no arm, no false detections. For tests of the solution 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,6 @@ from station.calibration.rig import CameraCalibration, Rig
 from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
 from station.drivers.virtual import FRAME_RATE_HZ, SimulatedBooth, SimulatedUnit
 from station.drivers.virtual_calibration import BALL, VirtualProcedure
-from station.drivers.virtual_noise import Window
 from station.drivers.virtual_scene import default_rig
 from station.geometry import invert, se3_exp, transform
 
@@ -75,18 +75,11 @@ def observations(
 def _measured(
     unit: SimulatedUnit, camera: CameraCalibration, u: Array, v: Array, w: Array
 ) -> Array:
-    """Inverse depths as the unit reports them."""
-    columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
-    found = [
-        float(
-            unit.error.apply(
-                np.array([[depth]], np.float32),
-                Window(int(row), int(column), camera.height, camera.width),
-            )[0, 0]
-        )
-        for depth, row, column in zip(1.0 / w, rows, columns, strict=True)
-    ]
-    return 1.0 / np.array(found)
+    """Inverse depths as the unit reports them, its error written down once more."""
+    error, depth = unit.error, 1.0 / w
+    x, y = 2.0 * u / (camera.width - 1) - 1.0, 2.0 * v / (camera.height - 1) - 1.0
+    tilted = 1.0 + error.tilt[0] * x + error.tilt[1] * y
+    return np.asarray(1.0 / (depth + error.bias_m * tilted * (depth / 2.0) ** 2))
 
 
 def _ball(
@@ -151,3 +144,93 @@ def _floor(
     return PlaneObservation(
         camera.name, FLOOR, 12**2 * len(u), np.stack([u, v, measured, variance], axis=1)
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that goes wrong while a booth is calibrated, and what the operator must read."""
+
+    name: str
+    spoil: Callable[[Observations], Observations]
+    words: str
+    radius_m: float = 0.1
+
+
+def _balls(
+    seen: Observations, change: Callable[[BallDetection], BallDetection | None]
+) -> Observations:
+    changed = [change(ball) for ball in seen.balls]
+    return replace(seen, balls=[ball for ball in changed if ball is not None])
+
+
+def _middle(seen: Observations) -> float:
+    return float(np.median([ball.time_s for ball in seen.balls]))
+
+
+def _later(seen: Observations, camera: str, jump_s: float) -> Observations:
+    middle_s = _middle(seen)
+
+    def late(ball: BallDetection) -> BallDetection:
+        moved = ball.camera == camera and ball.time_s > middle_s
+        return replace(ball, time_s=ball.time_s + jump_s) if moved else ball
+
+    return _balls(seen, late)
+
+
+def _bumped(seen: Observations, camera: str) -> Observations:
+    """The camera turns by a degree midway: all it sees turns the other way."""
+    middle_s, turn = _middle(seen), se3_exp([0.0, np.radians(2.5), 0.0, 0.0, 0.0, 0.0])
+    shift_px = 585.0 * np.tan(np.radians(2.5))
+
+    def turned(ball: BallDetection) -> BallDetection:
+        if ball.camera != camera or ball.time_s < middle_s:
+            return ball
+        patches = ball.patches.copy()
+        patches[:, 0] += shift_px
+        return replace(ball, center_m=transform(turn, ball.center_m), patches=patches)
+
+    return _balls(seen, turned)
+
+
+def _scattering(seen: Observations, camera: str) -> Observations:
+    rng = np.random.default_rng(5)
+
+    def scattered(ball: BallDetection) -> BallDetection:
+        if ball.camera != camera:
+            return ball
+        patches = ball.patches.copy()
+        patches[:, 2] += rng.normal(0.0, 6e-3)
+        shift_m = rng.normal(0.0, 0.01, 3)
+        return replace(ball, center_m=ball.center_m + shift_m, patches=patches)
+
+    return _balls(seen, scattered)
+
+
+def _near(seen: Observations, seconds: float) -> Observations:
+    start_s = min(ball.time_s for ball in seen.balls)
+    return _balls(seen, lambda ball: ball if ball.time_s < start_s + seconds else None)
+
+
+FAULTS = (
+    Fault(
+        "a camera that sees nothing",
+        lambda seen: _balls(seen, lambda b: None if b.camera == "back-lower" else b),
+        "camera back-lower saw the ball in 0 frames",
+    ),
+    Fault("a sensor that scatters", lambda seen: _scattering(seen, "front-lower"), "front-lower"),
+    Fault("another ball", lambda seen: seen, "the ball measures 100 mm in radius", 0.11),
+    Fault("too short", lambda seen: _near(seen, 14.0), "camera "),
+    Fault("nothing on the mark", lambda seen: replace(seen, mark=()), "on the mark"),
+    Fault("no floor", lambda seen: replace(seen, planes=()), "the floor"),
+    Fault(
+        "a clock reset by a second",
+        lambda seen: _later(seen, "back-upper", 1.0),
+        "the clock of camera back-upper jumped",
+    ),
+    Fault(
+        "a clock that slips by a frame",
+        lambda seen: _later(seen, "front-lower", 0.033),
+        "the clock of camera front-lower jumped",
+    ),
+    Fault("a camera bumped midway", lambda seen: _bumped(seen, "back-lower"), "back-lower"),
+)

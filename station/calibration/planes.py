@@ -113,11 +113,12 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
     if len(ray) < 100:
         return None
     rng = np.random.default_rng(0)
-    best, most = None, 99
+    best: Array | None = None
+    most = 99
     for _ in range(_TRIALS):
         corner = rng.choice(len(ray), 3, replace=False)
         try:
-            plane = np.linalg.solve(ray[corner], inverse[corner])
+            plane = np.asarray(np.linalg.solve(ray[corner], inverse[corner]), np.float64)
         except np.linalg.LinAlgError:
             continue
         length = float(np.linalg.norm(plane))

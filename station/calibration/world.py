@@ -83,18 +83,30 @@ def twist_between(pose: Array, other: Array) -> Array:
     return np.concatenate([so3_log(difference[:3, :3]), difference[:3, 3]])
 
 
+def relatives(placed: Placed, a: str, others: Sequence[str]) -> tuple[list[Array], Array]:
+    """a_from_b (4, 4) of each other camera b, and the covariance (6 k, 6 k) of all their xi.
+
+    xi is in camera b's frame: a_from_b @ se3_exp(xi).
+    """
+    names = list(placed.world_from_camera)
+    i = names.index(a)
+    found = []
+    select = np.zeros((6 * len(others), 6 * len(names)))
+    for row, b in enumerate(others):
+        j = names.index(b)
+        a_from_b = invert(placed.world_from_camera[a]) @ placed.world_from_camera[b]
+        rows = np.s_[6 * row : 6 * row + 6]
+        # exp(-xi_a) a_from_b exp(xi_b): what stands on the left is carried to the right side.
+        select[rows, 6 * i : 6 * i + 6] -= _adjoint(invert(a_from_b))
+        select[rows, 6 * j : 6 * j + 6] += np.eye(6)
+        found.append(a_from_b)
+    return found, select @ placed.covariance @ select.T
+
+
 def relative(placed: Placed, a: str, b: str) -> tuple[Array, Array]:
     """a_from_b (4, 4) and the covariance (6, 6) of its xi, in camera b's frame."""
-    names = list(placed.world_from_camera)
-    i, j = names.index(a), names.index(b)
-    a_from_b = invert(placed.world_from_camera[a]) @ placed.world_from_camera[b]
-    # a_from_b exp(xi) = exp(-xi_a) a_from_b exp(xi_b), and exp(-xi_a) moved to the right side
-    # turns with the transform.
-    carry = -_adjoint(invert(a_from_b))
-    select = np.zeros((6, 6 * len(names)))
-    select[:, 6 * i : 6 * i + 6] += carry
-    select[:, 6 * j : 6 * j + 6] += np.eye(6)
-    return a_from_b, select @ placed.covariance @ select.T
+    transforms, covariance = relatives(placed, a, [b])
+    return transforms[0], covariance
 
 
 def _adjoint(b_from_a: Array) -> Array:
