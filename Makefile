@@ -3,15 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-fit bench-drift
+BENCHES := bench-capture bench-calibration bench-drift bench-fit bench-measure
 
-.PHONY: help demo test check format train clean $(BENCHES)
+.PHONY: help demo test check format train evaluate-model intervals clean $(BENCHES)
 
 help:
 	@echo "make demo     a booth of four replayed Kinects: calibrate, scan, print the result"
 	@echo "make test     all tests"
 	@echo "make check    lint, formatting and types"
-	@echo "make train    learn the body model anew (30 minutes)"
+	@echo "make train    learn the body model anew (minutes)"
+	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
+	@echo "make intervals  calibrate the measurements' intervals anew, after any change to model or fit"
 	@echo "make $(BENCHES)   tables of speed and accuracy"
 
 demo: $(VENV)/runtime.stamp
@@ -32,9 +34,16 @@ format: $(VENV)/dev.stamp
 train: $(VENV)/train.stamp
 	$(BIN)/reconstruct train --out workers/scape/data/body.npz
 
-# The benchmark of the fit renders bodies that the model never saw, which takes the training extra.
-bench-fit: $(VENV)/train.stamp
-bench-capture bench-drift: $(VENV)/dev.stamp
+evaluate-model: $(VENV)/train.stamp
+	$(BIN)/reconstruct evaluate-model $(ARGS)
+
+intervals: $(VENV)/train.stamp
+	$(BIN)/python tests/bench/bench_measure.py --calibrate 96 $(ARGS)
+
+# The benchmarks of fit and measurements render bodies that the model never saw, which takes
+# the training extra.
+bench-fit bench-measure: $(VENV)/train.stamp
+bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -48,6 +49,8 @@ def main() -> int:
         calibrate = [*STATION, "calibrate", "--recordings", str(booth / PROCEDURE)]
         if subprocess.run(calibrate, env=environment, check=False).returncode:
             return 1
+        # What was seen is kept beside the calibration; the recordings take a gigabyte.
+        shutil.rmtree(booth / PROCEDURE)
     compare(Rig.load(booth / "calibration.json"), Rig.load(booth / TRUTH))
     log = (booth / "station.log").open("w")
     print(f"starting the station (log: {log.name}) ...", flush=True)

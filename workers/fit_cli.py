@@ -22,9 +22,21 @@ from workers.scape.fit import Method
     "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="new folder"
 )
 @click.option("--method", type=click.Choice(get_args(Method)), default="joint", show_default=True)
+@click.option(
+    "--debug",
+    "debug_folder",
+    type=click.Path(path_type=Path),
+    help="folder for pictures of every stage: cloud, pairs, body over cloud, error map",
+)
 @click.option("--quiet", is_flag=True, help="no progress")
 def fit(
-    bundle: Path | None, cloud: Path | None, up: str, out_folder: Path, method: Method, quiet: bool
+    bundle: Path | None,
+    cloud: Path | None,
+    up: str,
+    out_folder: Path,
+    method: Method,
+    debug_folder: Path | None,
+    quiet: bool,
 ) -> None:
     """Reconstruct a scan bundle, or a point cloud from any scanner.
 
@@ -34,6 +46,7 @@ def fit(
     Examples:
       reconstruct fit spool/done/20261121T100000Z-7f3a --out result
       reconstruct fit --cloud body.ply --up y --out result
+      reconstruct fit BUNDLE --out result --debug pictures
     """
     if (bundle is None) == (cloud is None):
         raise click.UsageError("give a bundle, or --cloud FILE")
@@ -41,6 +54,16 @@ def fit(
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
     from workers import job
     from workers.point_cloud import read_cloud
+    from workers.scape.model import load_model
+    from workers.scape.observer import Observer, unobserved
+
+    model = None
+    observer: Observer = unobserved
+    if debug_folder is not None:
+        from workers.debug_pictures import DebugPictures
+
+        model = load_model()
+        observer = DebugPictures(debug_folder, model.faces)
 
     def show(step: str, share: float) -> None:
         if not quiet:
@@ -50,11 +73,19 @@ def fit(
     temporary = Path(tempfile.mkdtemp(prefix=".fit-", dir=out_folder.parent))
     try:
         if bundle is not None:
-            summary = job.reconstruct_bundle(bundle, temporary, method=method, progress=show)
+            summary = job.reconstruct_bundle(
+                bundle, temporary, method=method, model=model, progress=show, observer=observer
+            )
         else:
             assert cloud is not None
             summary = job.reconstruct_cloud(
-                read_cloud(cloud, up), cloud.stem, temporary, method=method, progress=show
+                read_cloud(cloud, up),
+                cloud.stem,
+                temporary,
+                method=method,
+                model=model,
+                progress=show,
+                observer=observer,
             )
         publish_folder(temporary, out_folder)
     finally:

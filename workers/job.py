@@ -12,10 +12,14 @@ from pathlib import Path
 
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
+from workers.export.meshes import obj_mesh
 from workers.export.result import write_result
-from workers.measure.body import measure_body
+from workers.measure.body import measure_body, measure_standing
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
+from workers.scape.intersections import untangled
 from workers.scape.model import BodyModel, load_model
+from workers.scape.observer import Observer, unobserved
+from workers.scape.skeleton import joint_positions
 from workers.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
@@ -37,7 +41,11 @@ def warm_up() -> BodyModel:
 
     model = load_model()
     sampling_of(model)
+    untangled(model, model.mean, model.mean)
+    joint_positions(model, model.mean, model.neutral_state().rotations)
+    obj_mesh(model.mean, model)
     compile_average()
+    measure_body(model, model.mean)
     return model
 
 
@@ -49,6 +57,7 @@ def reconstruct_bundle(
     model: BodyModel | None = None,
     volume: Volume | None = None,
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JobSummary:
     """Reconstruct a scan bundle into a folder that exists and is empty.
 
@@ -63,7 +72,7 @@ def reconstruct_bundle(
     progress("filtering", 0.0)
     with watch.step("preprocess"):
         scan = preprocess(bundle, volume)
-    fit = fit_body(model, scan, method=method, progress=progress)
+    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
     return _finish(model, fit, scan.cloud, bundle.scan_id, method, out_folder, watch, progress)
 
 
@@ -75,12 +84,15 @@ def reconstruct_cloud(
     method: Method = "joint",
     model: BodyModel | None = None,
     progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
 ) -> JobSummary:
     """Reconstruct a bare cloud, from any scanner."""
     watch = Stopwatch()
     with watch.step("load"):
         model = model or load_model()
-    fit = fit_body(model, Preprocessed(cloud, (), ()), method=method, progress=progress)
+    with watch.step("preprocess"):
+        scan = Preprocessed(cloud, (), ())
+    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
     return _finish(model, fit, cloud, scan_id, method, out_folder, watch, progress)
 
 
@@ -97,7 +109,8 @@ def _finish(
     watch.seconds.update(fit.seconds)
     progress("measuring", 0.0)
     with watch.step("measure"):
-        measurements = measure_body(model, fit.vertices, fit.vertex_sigma_m)
+        measured = measure_body(model, fit.vertices, fit.vertex_sigma_m)
+        standing = measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
-    write_result(out_folder, model, fit, cloud, measurements, scan_id, method, watch)
+    write_result(out_folder, model, fit, cloud, measured, standing, scan_id, method, watch)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+from numpy.typing import NDArray
 
 from station.depth import PointCloud
 from station.errors import InputError
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int32]
 
 _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
@@ -53,15 +57,44 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     )
 
 
-def read_mesh_vertices(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """The vertices (n, 3) of a mesh file.
+def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
+    """The vertices (P, 3) of a mesh file with the template's triangles (K, 3), z up.
+
+    Args:
+        up: "z" or "y", the axis that points up in the file.
 
     Raises:
-        InputError: the file is missing, is no mesh, or holds no numbers.
+        InputError: the file is missing, is no mesh, holds no numbers or has other triangles.
     """
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a result folder or a mesh")
-    vertices = np.asarray(o3d.io.read_triangle_mesh(path).vertices)
-    if not len(vertices) or not np.isfinite(vertices).all():
-        raise InputError(f"{path} holds no usable mesh")
-    return vertices
+    vertices, corners = _obj(path) if path.suffix.lower() == ".obj" else _ply(path)
+    if not len(corners) or not np.isfinite(vertices).all():
+        raise InputError(f"{path} holds no usable mesh; give a .ply or .obj of triangles")
+    if not np.array_equal(corners, faces):
+        raise InputError(
+            f"{path} has {len(vertices)} vertices and {len(corners)} triangles that are not the "
+            f"template's {faces.max() + 1} and {len(faces)}; fit it first: "
+            f"reconstruct fit --cloud {path} --up {up} --out result"
+        )
+    return vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) if up == "y" else vertices
+
+
+def _ply(path: Path) -> tuple[Array, Faces]:
+    if path.suffix.lower() != ".ply":
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    mesh = o3d.io.read_triangle_mesh(path)
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def _obj(path: Path) -> tuple[Array, Faces]:
+    """Vertices and triangles in the file's own order, which open3d's reader does not keep."""
+    try:
+        lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        vertices = [words[1:4] for words in lines if words[:1] == ["v"]]
+        corners = [
+            [word.split("/")[0] for word in words[1:4]] for words in lines if words[:1] == ["f"]
+        ]
+        return np.array(vertices, float).reshape(-1, 3), np.array(corners, np.int32) - 1
+    except ValueError:
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)

@@ -31,7 +31,7 @@ from station.transport import ask, publisher, subscriber
 
 _POLL_S = 0.05
 _LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
-"""How many frames wait for whoever looks at them; each is 0.6 MB."""
+"""How many frames wait to be taken; each is 0.6 MB."""
 _STOP_S = 5.0
 _GATHER_S = 20.0
 
@@ -115,6 +115,11 @@ class Feed:
 
     def __exit__(self, *_: object) -> None:
         self._context.destroy(linger=0)
+
+    @property
+    def replays(self) -> bool:
+        """Whether these are recordings, not live cameras."""
+        return bool(self._clocks)
 
     @property
     def over(self) -> bool:

@@ -56,7 +56,7 @@ class StaticView:
             buffer,
             version=np.array(VERSION),
             inverse_depth=self.inverse_depth,
-            share=np.rint(255 * self.share).astype(np.uint8),
+            readings=np.rint(self.frames * self.share).astype(np.uint16),
             noise=self.noise.astype(np.float16),
             outline_noise=self.outline_noise.astype(np.float16),
             frames=np.array(self.frames),
@@ -78,12 +78,13 @@ class StaticView:
                         f"{path} has version {version}; this program reads {VERSION}; "
                         "run station calibrate floor"
                     )
+                frames = int(archive["frames"])
                 return cls(
                     inverse_depth=archive["inverse_depth"],
-                    share=archive["share"].astype(np.float32) / 255.0,
+                    share=archive["readings"].astype(np.float32) / np.float32(frames),
                     noise=archive["noise"].astype(np.float32),
                     outline_noise=archive["outline_noise"].astype(np.float32),
-                    frames=int(archive["frames"]),
+                    frames=frames,
                 )
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as cause:
             raise FormatError(

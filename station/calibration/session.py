@@ -29,8 +29,8 @@ SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
 EMPTY, BALL, MARK, FRONT, WALL = "empty", "ball", "mark", "front", "wall"
-_BETWEEN_RUNS_S = 3600.0
-"""Runs of waving are set this far apart: their clocks may have nothing in common."""
+_BETWEEN_RUNS_S = 10.0
+"""Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +58,8 @@ class Session:
     """Step -> the surfaces seen in it."""
     lenses: dict[str, Lens] = field(default_factory=dict)
     runs: int = 0
+    _later_s: float | None = 0.0
+    """What this run's times are moved by; None until its first detection."""
 
     @classmethod
     def begin(
@@ -203,11 +205,12 @@ class Session:
         step = str(entry["step"])
         if step == "run":
             self.runs += 1
+            self._later_s = None
         elif step == "forget-balls":
             self.balls.clear()
         elif step == BALL:
-            later_s = self.runs * _BETWEEN_RUNS_S
             seen = [BallDetection.from_json(ball) for ball in entry["balls"]]
+            later_s = self._moved_by(min(ball.time_s for ball in seen))
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
@@ -216,3 +219,10 @@ class Session:
                 self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
         else:
             self.planes[step] = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
+
+    def _moved_by(self, first_s: float) -> float:
+        """By what a run's times are moved, so that it follows the runs before."""
+        if self._later_s is None:
+            before = [ball.time_s for ball in self.balls]
+            self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
+        return self._later_s

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.ball import find_ball
 from station.calibration.coverage import Coverage
 from station.calibration.detections import BallDetection, PlaneObservation
 from station.calibration.feed import Feed, TimedFrame, gather_frames
+from station.calibration.finder import BallFinder
 from station.calibration.guide import Guide
 from station.calibration.planes import observe_floor, observe_wall
-from station.calibration.rig import CameraCalibration
-from station.calibration.scene import Image, static_view
+from station.calibration.scene import Image, smoothed, static_view
 from station.calibration.session import Session
 from station.errors import CalibrationError
 
@@ -26,10 +23,11 @@ _RESTING_S = 60.0
 _RESTING_DETECTIONS = 12
 _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
-_KEEP_EVERY_S = 1.0
-_DETECTORS = 2
+_OTHERS_S = 3.0
+"""After the first camera others have so long to see it at rest, too."""
+_WRITE_EVERY_S = 1.0
 _OFTEN = 0.9
-_MOVED_PER_M, _MOVED_SHARE = 0.03, 0.002
+_MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
 
 
@@ -100,7 +98,8 @@ def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
     before = static_view((frame.depth for frame in frames[:half]), scale_m)
     after = static_view((frame.depth for frame in frames[half:]), scale_m)
     both = (before.share > _OFTEN) & (after.share > _OFTEN)
-    change = np.abs(before.inverse_depth - after.inverse_depth)[both]
+    surface, surface_after = (smoothed(v.inverse_depth, v.share)[0] for v in (before, after))
+    change = np.abs(surface - surface_after)[both]
     if float(np.mean(change > _MOVED_PER_M)) > _MOVED_SHARE:
         raise CalibrationError(
             f"something moved in front of camera {name}; leave the booth and do it again"
@@ -113,17 +112,22 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     Raises:
         CalibrationError: it was not seen at rest.
     """
-    finder = _BallFinder(session)
     recent: dict[str, list[BallDetection]] = {name: [] for name in session.cameras}
-    deadline_s = time.monotonic() + _RESTING_S
-    with ThreadPoolExecutor(_DETECTORS) as pool:
-        while time.monotonic() < deadline_s and not feed.over:
-            for ball in filter(None, pool.map(finder.find, feed.newest())):
+    still: dict[str, list[BallDetection]] = {}
+    now_s = time.monotonic()
+    give_up_s, settled_s = now_s + _RESTING_S, np.inf
+    with BallFinder(session, patient=feed.replays) as finder:
+        while now_s < min(give_up_s, settled_s) and not feed.over:
+            finder.look(feed.newest())
+            for ball in finder.found():
                 recent[ball.camera].append(ball)
             still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
             guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
-            if len(still) == len(recent):
-                break
+            now_s = time.monotonic()
+            if still:
+                settled_s = min(settled_s, now_s + _OTHERS_S)
+        for ball in finder.found(wait=True):
+            recent[ball.camera].append(ball)
     still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
     if not still:
         raise CalibrationError(
@@ -159,35 +163,44 @@ def wave_ball(
 
     What was seen is on disk within a second; Ctrl-C ends the step and keeps it.
     """
-    finder = _BallFinder(session)
     coverage = covered(session, reference)
     session.begin_run()
     resets = feed.clock_resets()
     waiting: list[BallDetection] = []
-    began_s = kept_s = time.monotonic()
-    with ThreadPoolExecutor(_DETECTORS) as pool:
+
+    def keep(balls: list[BallDetection]) -> None:
+        for ball in balls:
+            coverage.add(ball)
+        waiting.extend(balls)
+
+    def write() -> None:
+        session.keep_balls(waiting)
+        waiting.clear()
+
+    began_s = written_s = time.monotonic()
+    with BallFinder(session, patient=feed.replays) as finder:
         try:
             while not feed.over:
-                now_s = time.monotonic()
-                left_s = lasts_s - (now_s - began_s)
-                if left_s <= 0.0 and (coverage.enough or left_s < -lasts_s):
-                    break
-                for ball in filter(None, pool.map(finder.find, feed.newest())):
-                    waiting.append(ball)
-                    coverage.add(ball)
+                finder.look(feed.newest())
+                keep(finder.found())
                 if feed.clock_resets() != resets:
                     # What follows cannot be put in time with what went before.
-                    session.keep_balls(waiting)
-                    waiting, resets = [], feed.clock_resets()
+                    write()
+                    resets = feed.clock_resets()
                     session.begin_run()
-                if now_s - kept_s > _KEEP_EVERY_S:
-                    session.keep_balls(waiting)
-                    waiting, kept_s = [], now_s
+                now_s = time.monotonic()
+                if now_s - written_s > _WRITE_EVERY_S:
+                    write()
+                    written_s = now_s
+                left_s = lasts_s - (now_s - began_s)
                 guide.progress(_wave_line(coverage, left_s))
+                if not feed.replays and left_s < (0.0 if coverage.enough else -lasts_s):
+                    break
+            keep(finder.found(wait=True))
         except KeyboardInterrupt:
             guide.say("stopped; what was seen is kept")
         finally:
-            session.keep_balls(waiting)
+            write()
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
     for name, (near, moments) in coverage.ties().items():
@@ -199,25 +212,6 @@ def wave_ball(
 def _wave_line(coverage: Coverage, left_s: float) -> str:
     time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
     return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}"
-
-
-class _BallFinder:
-    """Finds the ball of a session in front of its empty booth."""
-
-    def __init__(self, session: Session) -> None:
-        self._radius_m = session.radius_m
-        self._cameras: Mapping[str, CameraCalibration] = session.lensed_cameras()
-        self._backgrounds = {name: _background(session, name) for name in session.cameras}
-
-    def find(self, frame: TimedFrame) -> BallDetection | None:
-        name = frame.camera
-        return find_ball(
-            frame.depth_m(),
-            self._cameras[name],
-            self._radius_m,
-            frame.time_s,
-            background_m=self._backgrounds[name],
-        )
 
 
 def _background(session: Session, camera: str) -> Image | None:

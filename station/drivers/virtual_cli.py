@@ -18,8 +18,10 @@ from station.recording import RecordedFrame, write_recording
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error where a calibration has to find it."""
-_STRIDE = 3
-"""Of the waved ball every third frame is kept: who looks for it is slower than the sensors."""
+_STRIDE = {BALL: 3}
+_OTHER_STRIDE = 2
+"""Of a calibration every second or third frame is kept: who looks is slower than the sensors."""
+_BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 
 
@@ -74,7 +76,7 @@ def record_virtual(
         for name in booth.rig.cameras
     }
     if waving_s is not None:
-        procedure = VirtualProcedure(booth, waving_s=waving_s)
+        procedure = VirtualProcedure(booth, waving_s=waving_s, board_at_m=_BOARD_AT_M)
         for step in procedure.steps:
             for name in booth.rig.cameras:
                 folder = out_folder / PROCEDURE / step / name
@@ -106,7 +108,7 @@ def _record_person(
 
 
 def _record_step(procedure: VirtualProcedure, name: str, step: str, folder: Path) -> int:
-    stride = _STRIDE if step == BALL else 1
+    stride = _STRIDE.get(step, _OTHER_STRIDE)
     return write_recording(folder, _frames_of(procedure, name, step, stride), tick_hz=TICK_HZ)
 
 

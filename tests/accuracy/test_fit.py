@@ -9,6 +9,7 @@ import pytest
 from station.bundle import read_bundle
 from station.depth import preprocess
 from workers.scape.fit import FitResult, fit_body
+from workers.scape.intersections import self_intersections, turned_over
 from workers.scape.model import BodyModel, load_model
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
@@ -53,6 +54,8 @@ def test_the_mesh_is_watertight_and_not_folded(model: BodyModel, fitted: FitResu
     _, counts = np.unique(edges, axis=0, return_counts=True)
     assert (counts == 2).all()
     assert np.isfinite(fitted.vertices).all()
+    assert self_intersections(fitted.vertices, model.faces) == 0
+    assert not turned_over(fitted.vertices, model.vertices(fitted.state), model.faces).any()
 
 
 def test_same_input_same_output(model: BodyModel, bundle: Path, fitted: FitResult) -> None:

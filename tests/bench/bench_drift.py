@@ -7,6 +7,7 @@ in the booth. Noise is simulated anew for every scan.
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from station.calibration.drift import (
     estimate_move,
 )
 from station.calibration.rig import CameraCalibration
-from station.calibration.scene import static_view
+from station.calibration.scene import StaticView, static_view
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import SimulatedBooth, SimulatedUnit
 from station.drivers.virtual_noise import TrueView, observe
@@ -57,8 +58,10 @@ class _Sensor:
         self._unit = SimulatedUnit.of(booth, name)
         self._around = [*booth_walls(), *booth.clutter]
         self._rng = np.random.default_rng((7, list(booth.rig.cameras).index(name)))
-        stored = static_view(self.frames(self.view(None), STORED_FRAMES), DEPTH_SCALE_M)
-        self.reference = DriftReference.prepare(self.camera, stored)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "view.npz"
+            static_view(self.frames(self.view(None), STORED_FRAMES), DEPTH_SCALE_M).save(path)
+            self.reference = DriftReference.prepare(self.camera, StaticView.load(path))
 
     def view(self, body: Mesh | None, xi: NDArray[np.float64] | None = None) -> TrueView:
         pose = self.camera.world_from_camera

@@ -122,7 +122,8 @@ def test_a_stored_view_comes_back(stored: StaticView, tmp_path: Path) -> None:
     stored.save(path)
     found = StaticView.load(path)
     assert np.array_equal(found.inverse_depth, stored.inverse_depth)
-    assert np.allclose(found.share, stored.share, atol=0.003)
+    # Shares once came back in steps of 1/255: the wall stood 2 mm nearer, and cameras "moved".
+    assert np.allclose(found.share, stored.share, rtol=0.0, atol=1e-6)
     assert np.allclose(found.noise, stored.noise, rtol=1e-3, atol=1e-6)
     assert found.frames == 30
     depth = found.depth_m()

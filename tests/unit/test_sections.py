@@ -2,36 +2,91 @@ import numpy as np
 import pytest
 
 from station.drivers.virtual_scene import sphere
-from workers.measure.definitions import DEFINITIONS
-from workers.measure.sections import hull_loop, loop_length, section_points, surface_path
-from workers.scape.model import load_model
+from workers.measure.sections import (
+    EdgeNet,
+    EdgePoints,
+    enclosed_volume,
+    hull_order,
+    loop_length,
+    plane_axes,
+    surface_order,
+)
+
+TILTED = np.array([0.6, 0.0, 0.8])
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_a_spheres_girth() -> None:
-    ball = sphere((0.1, 0.2, 1.0), 0.1)
-    points = section_points(
-        ball.vertices, ball.faces, np.array([0.1, 0.2, 1.0]), np.array([0.6, 0.0, 0.8])
-    )
-    loop = hull_loop(points, np.array([0.6, 0.0, 0.8]))
-    assert loop_length(loop, closed=True) == pytest.approx(2 * np.pi * 0.1, rel=0.01)
+    center = np.array([0.1, 0.2, 1.0])
+    ball = sphere(tuple(center), 0.1)
+    found, piece = EdgeNet.build(ball.faces).cut(ball.vertices, center, TILTED)
+    points = found.on(ball.vertices)
+    assert np.abs((points - center) @ TILTED).max() < 1e-12
+    assert len(np.unique(piece)) == 1
+    tape = points[hull_order(points, TILTED)]
+    assert loop_length(tape, closed=True) == pytest.approx(2 * np.pi * 0.1, rel=0.01)
+
+
+def test_two_legs_are_two_pieces() -> None:
+    """A thigh's girth once took the other thigh in, where both came near each other."""
+    left, right = sphere((-0.1, 0.0, 0.0), 0.099), sphere((0.1, 0.0, 0.0), 0.099)
+    vertices = np.concatenate([left.vertices, right.vertices])
+    faces = np.concatenate([left.faces, right.faces + len(left.vertices)]).astype(np.int32)
+    found, piece = EdgeNet.build(faces).cut(vertices, np.zeros(3), UP)
+    x = found.on(vertices)[:, 0]
+    assert len(np.unique(piece)) == 2
+    assert len(np.unique(piece[x < 0])) == len(np.unique(piece[x > 0])) == 1
+
+
+def test_a_tape_spans_hollows() -> None:
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    radius = 0.1 - 0.03 * np.exp(-(((angle - np.pi) / 0.3) ** 2))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    tape = points[hull_order(points, UP)]
+    assert loop_length(tape, closed=True) < loop_length(points, closed=True) - 0.005
+    assert loop_length(tape, closed=True) == pytest.approx(2 * np.pi * 0.1, rel=0.02)
 
 
 def test_a_tape_over_a_sphere() -> None:
     ball = sphere((0.0, 0.0, 0.0), 0.1)
     start, end = np.array([-0.06, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])
-    path = surface_path(ball.vertices, ball.faces, start, end, np.array([0.0, 0.0, 1.0]))
+    found, _ = EdgeNet.build(ball.faces).cut(ball.vertices, start, np.array([0.0, 1.0, 0.0]))
+    points = found.on(ball.vertices)
+    order = surface_order(points, start, end, UP, taut=True)
+    path = np.concatenate([start[None], points[order], end[None]])
     assert loop_length(path, closed=False) == pytest.approx(0.1 * 2 * np.arcsin(0.6), rel=0.02)
+
+
+def test_skin_follows_a_hollow_that_a_tape_spans() -> None:
+    x = np.linspace(0.01, 0.29, 60)
+    points = np.stack([x, 0 * x, 0.012 * np.cos(2 * np.pi * x / 0.15)], axis=1)
+    ends = np.array([0.0, 0.0, 0.012]), np.array([0.3, 0.0, 0.012])
+    tape = surface_order(points, *ends, UP, taut=True)
+    skin = surface_order(points, *ends, UP, taut=False)
+    assert len(skin) == 60
+    assert len(tape) < 3
+
+
+def test_a_point_on_an_edge_goes_with_the_mesh() -> None:
+    found = EdgePoints(np.array([0]), np.array([1]), np.array([0.25]))
+    moved = np.array([[0.0, 0.0, 1.0], [0.0, 0.4, 1.0]])
+    assert found.on(moved).tolist() == [[0.0, 0.1, 1.0]]
 
 
 def test_a_plane_beside_the_body_is_an_error() -> None:
     with pytest.raises(ValueError, match="does not cut"):
-        hull_loop(np.empty((0, 3)), np.array([0.0, 0.0, 1.0]))
+        hull_order(np.empty((0, 3)), UP)
 
 
-def test_the_table_names_only_what_the_model_has() -> None:
-    model = load_model()
-    assert len(DEFINITIONS) >= 30
-    assert len({definition.name for definition in DEFINITIONS}) == len(DEFINITIONS)
-    for definition in DEFINITIONS:
-        assert set(definition.landmarks) <= set(model.landmarks)
-        assert set(definition.parts) <= set(model.part_names)
+def test_axes_of_a_plane_are_square_to_it() -> None:
+    for along in (None, np.array([1.0, 2.0, 3.0])):
+        x, y = plane_axes(TILTED, along)
+        np.testing.assert_allclose(np.array([x, y, TILTED]) @ np.array([x, y, TILTED]).T, np.eye(3),
+                                   atol=1e-12)  # fmt: skip
+
+
+def test_a_spheres_volume() -> None:
+    ball = sphere((0.3, -0.2, 1.0), 0.1)
+    assert enclosed_volume(ball.vertices, ball.faces) == pytest.approx(
+        4 / 3 * np.pi * 1e-3, rel=0.02
+    )

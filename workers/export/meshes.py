@@ -1,21 +1,16 @@
-"""Meshes and clouds as files: PLY, OBJ and GLB."""
+"""Meshes and clouds as PLY and OBJ: the world frame, metres, z up."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
-from workers.measure.body import Measurement
 from workers.scape.deformation import Faces, vertex_normals
+from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
-
-_Y_UP_FROM_Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
-_SKIN_COLOR = (0.80, 0.68, 0.60, 1.0)
 
 
 def ply_mesh(vertices: Array, faces: Faces) -> bytes:
@@ -40,33 +35,24 @@ def ply_cloud(points: Array, normals: Array) -> bytes:
     return header.encode() + np.concatenate([points, normals], axis=1).astype("<f4").tobytes()
 
 
-def obj_mesh(vertices: Array, faces: Faces) -> bytes:
-    """Wavefront OBJ with normals, world frame, metres."""
-    out = io.StringIO()
-    out.write("# metres, z up\n")
-    normals = vertex_normals(vertices, faces)
-    out.write(("v %.5f %.5f %.5f\n" * len(vertices)) % tuple(vertices.ravel()))
-    out.write(("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()))
-    corners = np.repeat(faces.ravel() + 1, 2)
-    out.write(("f %d//%d %d//%d %d//%d\n" * len(faces)) % tuple(corners))
-    return out.getvalue().encode()
+def obj_mesh(vertices: Array, model: BodyModel) -> bytes:
+    """Wavefront OBJ with normals, world frame, metres.
+
+    Without texture coordinates: common readers split the surface along their seams, and it would be
+    neither closed nor in the template's topology any more.
+    """
+    normals = vertex_normals(vertices, model.faces)
+    lines = [
+        "# metres, z up\n",
+        ("v %.6f %.6f %.6f\n" * len(vertices)) % tuple(vertices.ravel()),
+        ("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()),
+        _obj_faces(model),
+    ]
+    return "".join(lines).encode()
 
 
-def glb_mesh(vertices: Array, faces: Faces, measurements: Sequence[Measurement]) -> bytes:
-    """glTF binary, metres, y up: the body, and each measurement's line under its name."""
-    material = trimesh.visual.material.PBRMaterial(
-        name="skin", baseColorFactor=_SKIN_COLOR, metallicFactor=0.0, roughnessFactor=0.8
-    )
-    body = trimesh.Trimesh(
-        vertices, faces, vertex_normals=vertex_normals(vertices, faces), process=False
-    )
-    body.visual = trimesh.visual.TextureVisuals(material=material)
-    scene = trimesh.Scene()
-    scene.add_geometry(body, node_name="body", geom_name="body")
-    for row in measurements:
-        points = np.concatenate([row.path, row.path[:1]]) if row.closed else row.path
-        line = trimesh.load_path(points)
-        scene.add_geometry(line, node_name=row.name, geom_name=row.name)
-    scene.apply_transform(_Y_UP_FROM_Z_UP)
-    exported: bytes = scene.export(file_type="glb", include_normals=True)
-    return exported
+@lru_cache(maxsize=2)
+def _obj_faces(model: BodyModel) -> str:
+    """The faces' lines, which are the same for every body."""
+    corners = np.repeat(model.faces.ravel() + 1, 2)
+    return ("f %d//%d %d//%d %d//%d\n" * len(model.faces)) % tuple(corners)

@@ -3,47 +3,210 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.measure.body import Measurement
-from workers.render import draw_line, pixels, render_mesh, write_text
+from workers.render import (
+    BACKGROUND,
+    Color,
+    Frame,
+    Picture,
+    Rendering,
+    Scene,
+    draw_line,
+    png,
+    text_width,
+    write_text,
+)
+from workers.scape.verdict import Verdict
 
 Array = NDArray[np.float64]
 
-_SHOWN = {
-    "front": ("height", "chest_girth", "waist_girth", "hip_girth", "shoulder_width"),
-    "side": ("waist_girth",),
-    "back": ("arm_length_left", "thigh_girth_right", "calf_girth_left", "back_waist_length"),
+_SHOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "front": (
+        ("height", "neck_girth", "wrist_girth_right", "crotch_height", "knee_girth_right"),
+        ("chest_girth", "waist_girth", "hip_girth", "thigh_girth_left", "calf_girth_left"),
+    ),
+    "side": (
+        ("head_girth", "underbust_girth", "high_hip_girth", "mid_thigh_girth_left"),
+        ("upper_arm_girth_left", "arm_length_left", "ankle_girth_left"),
+    ),
+    "back": (
+        ("shoulder_width", "forearm_length_left"),
+        ("across_back_width", "back_waist_length", "elbow_girth_right"),
+    ),
 }
-_SIZE = (360, 640)
-_MARGIN = 1.12
+"""View -> rows named on its left and on its right; a row that was not measured is left out."""
+_BODY_PIXELS = 520
+_BORDER = 26
+_STRIP = 34
+"""Below the bodies: why to scan again."""
+_GAP = 14
+_LINE_GAP = 24
+_SIZE = 15
+_LINE: Color = (48, 56, 196)
+_HIDDEN: Color = (168, 172, 206)
+_LEADER: Color = (176, 172, 168)
+_WARNING: Color = (40, 60, 170)
+_FLOOR: Color = (226, 224, 222)
+_BEHIND_M = 0.012
+"""How far behind the skin a girth's line counts as hidden; it lies on the skin's far side."""
+_BENEATH_M = 0.06
+"""The same for straight distances, which run beneath the skin on the near side too."""
+_STATURE_GAP = 16
 
 
 def preview(
-    vertices: Array, faces: NDArray[np.int32], measurements: Sequence[Measurement]
+    vertices: Array,
+    faces: NDArray[np.int32],
+    measurements: Sequence[Measurement],
+    verdict: Verdict,
 ) -> bytes:
     """The picture as PNG."""
-    width, height = _SIZE
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    extent = high - low
-    scale = _MARGIN * max(extent[2] / height, max(extent[0], extent[1]) / width)
-    frame = {
-        "width": width, "height": height, "meters_per_pixel": scale, "center": 0.5 * (low + high),
-    }  # fmt: skip
     by_name = {measurement.name: measurement for measurement in measurements}
-    columns = []
-    for view, names in _SHOWN.items():
-        picture = render_mesh(vertices, faces, view, **frame)
-        for name in names:
-            row = by_name[name]
-            line = pixels(row.path, view, **frame)
-            draw_line(picture, line, closed=row.closed)
-            corner = int(min(line[:, 0].max() + 6, width - 120)), int(line[:, 1].mean())
-            write_text(picture, f"{name.split('_')[0]} {100 * row.value_m:.1f} cm", corner)
-        columns.append(picture)
-    done, encoded = cv2.imencode(".png", np.concatenate(columns, axis=1))
-    assert done
-    return encoded.tobytes()
+    scene = Scene(vertices, faces)
+    panels = [
+        _panel(scene, vertices, view, _rows(by_name, left), _rows(by_name, right))
+        for view, (left, right) in _SHOWN.items()
+    ]
+    picture = np.concatenate(panels, axis=1)
+    strip = np.full((_STRIP, picture.shape[1], 3), BACKGROUND, np.uint8)
+    if verdict.status != "ok":
+        words = _shortened("scan again: " + "; ".join(verdict.reasons), picture.shape[1] - 40)
+        write_text(strip, words, (20, 20), size=_SIZE, color=_WARNING)
+    return png(np.concatenate([picture, strip], axis=0))
+
+
+def _rows(by_name: dict[str, Measurement], names: tuple[str, ...]) -> list[Measurement]:
+    return [by_name[name] for name in names if name in by_name]
+
+
+def _label(row: Measurement) -> str:
+    words = [word for word in row.name.split("_") if word not in ("left", "right", "girth")]
+    return f"{' '.join(words)}  {100 * row.value_m:.1f} cm"
+
+
+def _panel(
+    scene: Scene,
+    vertices: Array,
+    view: str,
+    left: list[Measurement],
+    right: list[Measurement],
+) -> Picture:
+    """One view with its labels beside the body."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    scale = float(high[2] - low[2]) / _BODY_PIXELS
+    across = float(np.ptp(vertices[:, 0 if view != "side" else 1]))
+    x, y, z = (float(value) for value in 0.5 * (low + high))
+    room = 2 * (_STATURE_GAP + 4)
+    frame = Frame(view, int(across / scale) + room, _BODY_PIXELS + 2 * _BORDER, scale, (x, y, z))
+    rendering = scene.render(frame)
+    columns = [max((text_width(_label(row), size=_SIZE) for row in rows), default=0) + 2 * _GAP
+               for rows in (left, right)]  # fmt: skip
+    picture = np.full((frame.height, sum(columns) + frame.width, 3), BACKGROUND, np.uint8)
+    floor = frame.height - _BORDER
+    picture[floor : floor + 2] = _FLOOR
+    inner = picture[:, columns[0] : columns[0] + frame.width]
+    inner[:] = np.where(rendering.picture < BACKGROUND, rendering.picture, inner)
+    for rows, at_left in ((left, True), (right, False)):
+        ends = []
+        for row in rows:
+            line = _drawn(picture, row, frame, rendering, columns[0])
+            outermost = line[:, 0].argmin() if at_left else line[:, 0].argmax()
+            ends.append(line[outermost])
+        _write_labels(picture, rows, np.array(ends), columns, at_left=at_left)
+    return picture
+
+
+def _drawn(
+    picture: Picture, row: Measurement, frame: Frame, rendering: Rendering, shift: int
+) -> Array:
+    """Draw a measurement's line, paler where the body hides it; returns it in the picture."""
+    path = np.concatenate([row.path, row.path[:1]]) if row.closed else row.path
+    if row.name == "height":
+        return _drawn_stature(picture, path, frame, shift)
+    path = _finely(path, 2.0 * frame.meters_per_pixel)
+    line = frame.pixels(path)
+    u, v = np.rint(line).astype(int).T
+    u, v = np.clip(u, 0, frame.width - 1), np.clip(v, 0, frame.height - 1)
+    behind = _BEHIND_M if row.closed else _BENEATH_M
+    hidden = frame.depths(path) > rendering.depth_m[v, u] + behind
+    line = line + np.array([shift, 0.0])
+    for start, end in _runs(hidden):
+        piece = line[start : min(end + 1, len(line))]
+        if not (hidden[start] and row.closed):
+            draw_line(picture, piece, _HIDDEN if hidden[start] else _LINE)
+    return line
+
+
+def _drawn_stature(picture: Picture, path: Array, frame: Frame, shift: int) -> Array:
+    """The stature stands beside the body, between two ticks."""
+    line = frame.pixels(path) + np.array([shift, 0.0])
+    line[:, 0] = shift + 4.0
+    draw_line(picture, line, _LINE)
+    for end in line:
+        draw_line(picture, end + np.array([[-5.0, 0.0], [5.0, 0.0]]), _LINE)
+    return np.asarray(line.mean(axis=0, keepdims=True))
+
+
+def _finely(path: Array, step: float) -> Array:
+    """The line with points every `step` metres, so that each can be seen or hidden."""
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    wanted = np.linspace(0.0, along[-1], max(2, int(along[-1] / step)))
+    return np.stack([np.interp(wanted, along, path[:, i]) for i in range(3)], axis=1)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Stretches of equal values: first index, index after the last."""
+    changes = np.flatnonzero(np.diff(mask.astype(np.int8))) + 1
+    borders = [0, *changes.tolist(), len(mask)]
+    return list(pairwise(borders))
+
+
+def _write_labels(
+    picture: Picture,
+    rows: list[Measurement],
+    ends: Array,
+    columns: list[int],
+    *,
+    at_left: bool,
+) -> None:
+    """Names and values in a column beside the body, each with a thin line to what it names."""
+    if not rows:
+        return
+    order = np.argsort(ends[:, 1], kind="stable")
+    heights = _spread(ends[order, 1], _LINE_GAP, _LINE_GAP, picture.shape[0] - _BORDER - 6.0)
+    for index, height in zip(order, heights, strict=True):
+        text = _label(rows[index])
+        width = text_width(text, size=_SIZE)
+        edge = columns[0] - _GAP if at_left else picture.shape[1] - columns[1] + _GAP
+        knee = edge + (6.0 if at_left else -6.0)
+        leader = np.array([[knee, height], ends[index]])
+        draw_line(picture, leader, _LEADER, thickness=1)
+        at = (int(edge - width if at_left else edge), int(height + 5))
+        write_text(picture, text, at, size=_SIZE)
+
+
+def _spread(wanted: Array, gap: float, low: float, high: float) -> Array:
+    """Sorted places near the wanted ones, at least a gap apart, inside low and high."""
+    placed = wanted.copy()
+    for index in range(len(placed)):
+        placed[index] = max(placed[index], low if index == 0 else placed[index - 1] + gap)
+    limit = high
+    for index in range(len(placed))[::-1]:
+        placed[index] = min(placed[index], limit)
+        limit = placed[index] - gap
+    return np.asarray(placed)
+
+
+def _shortened(text: str, width: int) -> str:
+    """The text, cut where it would leave the picture."""
+    if text_width(text, size=_SIZE) <= width:
+        return text
+    while text and text_width(text + " …", size=_SIZE) > width:
+        text = text[:-1]
+    return text + " …"

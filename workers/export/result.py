@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,15 @@ import numpy as np
 
 from station import __version__
 from station.depth import PointCloud
-from workers.export.meshes import glb_mesh, obj_mesh, ply_cloud, ply_mesh
+from workers.export.gltf import avatar_glb, mesh_glb
+from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.preview import preview
-from workers.measure.body import Measurement
+from workers.measure.body import Content, MeasuredBody
 from workers.scape.fit import FitResult
 from workers.scape.model import BodyModel
 from workers.stopwatch import Stopwatch
 
+STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "open3d-cpu", "opencv-contrib-python-headless", "cholespy")
 
 
@@ -29,21 +30,29 @@ def write_result(
     model: BodyModel,
     fit: FitResult,
     cloud: PointCloud,
-    measurements: Sequence[Measurement],
+    measured: MeasuredBody,
+    standing: MeasuredBody,
     scan_id: str,
     method: str,
     watch: Stopwatch,
 ) -> None:
-    """Write a result's files into an existing folder; publishing it is the caller's."""
+    """Write a result's files into an existing folder; publishing it is the caller's.
+
+    Args:
+        measured: the body as scanned.
+        standing: the same body in the standard pose.
+    """
     with watch.step("export"):
         faces = model.faces
         files = {
             "mesh.ply": ply_mesh(fit.vertices, faces),
-            "mesh.obj": obj_mesh(fit.vertices, faces),
-            "mesh.glb": glb_mesh(fit.vertices, faces, measurements),
+            "mesh.obj": obj_mesh(fit.vertices, model),
+            "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
+            "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
             "cloud.ply": ply_cloud(cloud.points, cloud.normals),
-            "measurements.json": _json(measurements_document(scan_id, measurements)),
-            "preview.png": preview(fit.vertices, faces, measurements),
+            "measurements.json": _json(measurements_document(scan_id, measured)),
+            STANDARD_POSE_FILE: _json(measurements_document(scan_id, standing)),
+            "preview.png": preview(fit.vertices, faces, measured.rows, fit.verdict),
         }
         for name, content in files.items():
             (folder / name).write_bytes(content)
@@ -53,13 +62,20 @@ def write_result(
     (folder / "result.json").write_bytes(_json(document))
 
 
-def measurements_document(scan_id: str, measurements: Sequence[Measurement]) -> dict[str, Any]:
-    """measurements.json, format "booth-measurements", version 1."""
+def measurements_document(scan_id: str, measured: MeasuredBody) -> dict[str, Any]:
+    """measurements.json, format "booth-measurements", version 1.
+
+    Rows are lengths. Volume and surface have units of their own and stand beside the rows.
+    """
+
+    def content(found: Content) -> dict[str, Any]:
+        return {"value": found.value, "interval95": list(found.interval95)}
+
     return {
         "format": "booth-measurements",
         "version": 1,
         "scan_id": scan_id,
-        "pose": "as-scanned",
+        "pose": measured.pose,
         "measurements": [
             {
                 "name": row.name,
@@ -69,8 +85,10 @@ def measurements_document(scan_id: str, measurements: Sequence[Measurement]) -> 
                 "path": np.round(row.path, 5).tolist(),
                 "closed": row.closed,
             }
-            for row in measurements
+            for row in measured.rows
         ],
+        "volume_m3": content(measured.volume_m3),
+        "surface_m2": content(measured.surface_m2),
     }
 
 

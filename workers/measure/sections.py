@@ -1,42 +1,124 @@
-"""Plane sections of a mesh and the tape around them (pure geometry, metres)."""
+"""Plane sections of a mesh and the tape around them (pure geometry, metres).
+
+Every point of a section lies on an edge of the mesh and is kept as (tail, head, share): the same
+point can then be found on the same mesh in another pose.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
+Index = NDArray[np.intp]
 
 
-def section_points(vertices: Array, faces: Faces, point: Array, normal: Array) -> Array:
-    """Where the edges of triangles (k, 3) cross a plane, (n, 3)."""
-    distance = (vertices - point) @ normal
-    corner = distance[faces]
-    tail, head = faces, np.roll(faces, -1, axis=1)
-    crossing = (corner < 0) != (np.roll(corner, -1, axis=1) < 0)
-    a, b = tail[crossing], head[crossing]
-    share = distance[a] / (distance[a] - distance[b])
-    return np.asarray(vertices[a] + share[:, None] * (vertices[b] - vertices[a]))
+@dataclass(frozen=True, slots=True)
+class EdgePoints:
+    """n points on edges: tail + share (head - tail)."""
+
+    tail: Index
+    head: Index
+    share: Array
+
+    def on(self, vertices: Array) -> Array:
+        """Where they are (n, 3) on vertices (P, 3)."""
+        start = vertices[self.tail]
+        return np.asarray(start + self.share[:, None] * (vertices[self.head] - start))
+
+    def take(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> EdgePoints:
+        return EdgePoints(self.tail[chosen], self.head[chosen], self.share[chosen])
+
+    @classmethod
+    def at(cls, vertices: list[int]) -> EdgePoints:
+        """Points that are vertices."""
+        index = np.asarray(vertices, dtype=np.intp)
+        return cls(index, index, np.zeros(len(index)))
+
+    @classmethod
+    def joined(cls, pieces: list[EdgePoints]) -> EdgePoints:
+        return cls(
+            np.concatenate([piece.tail for piece in pieces]),
+            np.concatenate([piece.head for piece in pieces]),
+            np.concatenate([piece.share for piece in pieces]),
+        )
 
 
-def hull_loop(points: Array, normal: Array) -> Array:
-    """The convex hull (m, 3) of points in a plane, in order: the way of a tight tape.
+@dataclass(frozen=True, slots=True)
+class EdgeNet:
+    """The edges of some triangles of a mesh, ready to be cut."""
+
+    tails: Index
+    heads: Index
+    left: Index
+    """The triangle on one side of each edge ..."""
+    right: Index
+    """... and on the other; the same one again at a border."""
+
+    @classmethod
+    def build(cls, faces: Faces) -> EdgeNet:
+        """Of triangles (k, 3)."""
+        corners = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), 1)
+        owner = np.repeat(np.arange(len(faces)), 3)
+        pairs, edge = np.unique(corners, axis=0, return_inverse=True)
+        edge = edge.ravel()
+        left, right = np.zeros(len(pairs), np.intp), np.zeros(len(pairs), np.intp)
+        left[edge[::-1]] = owner[::-1]
+        right[edge] = owner
+        return cls(pairs[:, 0].astype(np.intp), pairs[:, 1].astype(np.intp), left, right)
+
+    def cut(self, vertices: Array, point: Array, normal: Array) -> tuple[EdgePoints, Index]:
+        """Where a plane cuts the edges, and which connected piece each point belongs to."""
+        away = (vertices - point) @ normal
+        from_m, to_m = away[self.tails], away[self.heads]
+        crossing = np.flatnonzero((from_m < 0.0) != (to_m < 0.0))
+        from_m, to_m = from_m[crossing], to_m[crossing]
+        found = EdgePoints(self.tails[crossing], self.heads[crossing], from_m / (from_m - to_m))
+        return found, self._pieces(crossing)
+
+    def _pieces(self, crossing: Index) -> Index:
+        """A cut triangle has two cut edges: it joins them."""
+        count = len(crossing)
+        triangle = np.concatenate([self.left[crossing], self.right[crossing]])
+        cut_edge = np.tile(np.arange(count), 2)
+        order = np.argsort(triangle, kind="stable")
+        triangle, cut_edge = triangle[order], cut_edge[order]
+        same = np.flatnonzero(triangle[1:] == triangle[:-1])
+        links = coo_matrix(
+            (np.ones(len(same)), (cut_edge[same], cut_edge[same + 1])), shape=(count, count)
+        )
+        return np.asarray(connected_components(links, directed=False)[1], np.intp)
+
+
+def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]:
+    """Two unit vectors in a plane, the first as near to `along` as can be."""
+    if along is None:
+        along = np.array((0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0))
+    x = along - normal * (along @ normal)
+    x = x / np.linalg.norm(x)
+    return x, np.cross(normal, x)
+
+
+def hull_order(points: Array, normal: Array) -> Index:
+    """Which of the points (n, 3) of a plane section a tight tape touches, in order.
 
     Raises:
         ValueError: fewer than three points, or all on a line.
     """
-    x = np.cross(normal, (0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0))
-    x /= np.linalg.norm(x)
-    y = np.cross(normal, x)
+    x, y = plane_axes(normal)
     if len(points) < 3:
         raise ValueError("the plane does not cut this part of the body")
     try:
         hull = ConvexHull(np.stack([points @ x, points @ y], axis=1))
     except QhullError:
         raise ValueError("the plane does not cut this part of the body") from None
-    return np.asarray(points[hull.vertices])
+    return np.asarray(hull.vertices, np.intp)
 
 
 def loop_length(points: Array, *, closed: bool) -> float:
@@ -45,28 +127,43 @@ def loop_length(points: Array, *, closed: bool) -> float:
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-def surface_path(vertices: Array, faces: Faces, start: Array, end: Array, outward: Array) -> Array:
-    """From start to end over the surface, (n, 3): a tape in the plane of both and of `outward`.
+BELOW_CHORD, ABOVE_CHORD = 0.10, 0.45
+"""What lies farther from the straight line than these shares of its length is another part of the
+body."""
 
-    The section's points beyond the straight line, bridged where they are hollow.
+
+def surface_order(points: Array, start: Array, end: Array, outward: Array, *, taut: bool) -> Index:
+    """Which of the points (n, 3) of a section lie outside between start and end, in order.
+
+    The section is that of the plane of both ends and of `outward`. A taut tape skips hollows.
     """
     along = end - start
     length = float(np.linalg.norm(along))
     along = along / length
-    normal = np.cross(along, outward)
-    normal /= np.linalg.norm(normal)
-    up = np.cross(normal, along)
-    points = section_points(vertices, faces, start, normal) - start
-    x, y = points @ along, points @ up
-    near = (x > 0) & (x < length) & (y > -0.02) & (y < 0.08)
-    chain = sorted({(0.0, 0.0), (length, 0.0), *zip(x[near], y[near], strict=True)})
-    hull: list[tuple[float, float]] = []
-    for candidate in chain:
-        while len(hull) >= 2 and _turns_left(hull[-2], hull[-1], candidate):
-            hull.pop()
-        hull.append(candidate)
-    return np.array([start + px * along + py * up for px, py in hull])
+    up = outward - along * (outward @ along)
+    up = up / np.linalg.norm(up)
+    x, y = (points - start) @ along, (points - start) @ up
+    order = np.flatnonzero(
+        (x > 0.0) & (x < length) & (y > -BELOW_CHORD * length) & (y < ABOVE_CHORD * length)
+    )
+    order = order[np.argsort(x[order], kind="stable")]
+    if not taut:
+        return order
+    kept: list[tuple[float, float, int]] = [(0.0, 0.0, -1)]
+    for candidate in [*zip(x[order], y[order], order.tolist(), strict=True), (length, 0.0, -1)]:
+        while len(kept) >= 2 and _turns_left(kept[-2], kept[-1], candidate):
+            kept.pop()
+        kept.append(candidate)
+    return np.array([index for _, _, index in kept[1:-1]], np.intp)
 
 
-def _turns_left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0
+def _turns_left(
+    a: tuple[float, float, int], b: tuple[float, float, int], c: tuple[float, float, int]
+) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0
+
+
+def enclosed_volume(vertices: Array, faces: Faces) -> float:
+    """Volume (m3) of a closed mesh with outward faces: the sum of signed tetrahedra."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return float(np.einsum("ki,ki->", a, np.cross(b, c)) / 6.0)

@@ -34,19 +34,35 @@ def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> Non
 
 
 @click.command()
-@click.option("--model", "path", type=click.Path(path_type=Path), help="the shipped one if absent")
+@click.option("--model", type=click.Path(path_type=Path), help="the shipped one if absent")
 @click.option("--bodies", default=100, show_default=True, help="held-out bodies")
 @click.option("--seed", default=0, show_default=True)
-def evaluate_model(path: Path | None, bodies: int, seed: int) -> None:
+@click.option(
+    "--pictures",
+    type=click.Path(path_type=Path),
+    help="folder for pictures: components, worst case",
+)
+@click.option(
+    "--other-bodies",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="folder of npz files (vertices, faces; z up, facing -y) in any topology",
+)
+def evaluate_model(
+    model: Path | None,
+    bodies: int,
+    seed: int,
+    pictures: Path | None,
+    other_bodies: Path | None,
+) -> None:
     """Test the model on bodies and poses that it was not learned from (needs the train extra).
 
     \b
     Examples:
       reconstruct evaluate-model
       reconstruct evaluate-model --model small.npz --bodies 20
+      reconstruct evaluate-model --pictures pictures --other-bodies scans
     """
-    from workers.scape.evaluate import evaluate
-    from workers.scape.model import load_model
+    from workers.scape.evaluate import Evaluation, evaluate
 
-    for line in evaluate(load_model(path), bodies, seed):
+    for line in evaluate(Evaluation(model, bodies, seed, pictures, other_bodies)):
         click.echo(line)

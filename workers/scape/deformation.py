@@ -35,6 +35,12 @@ def vertex_areas(vertices: Array, faces: Faces) -> Array:
     return np.asarray(np.bincount(faces.ravel(), thirds, minlength=len(vertices)), np.float64)
 
 
+def signed_volume(vertices: Array, faces: Faces) -> float:
+    """Volume in cubic metres of a closed surface, positive for faces that turn outwards."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return float(np.einsum("ki,ki->", a, np.cross(b, c))) / 6.0
+
+
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.database import PARTS, BodyDatabase, symmetry_map
+from workers.scape.database import PARTS, BodyDatabase
 from workers.scape.deformation import EdgeSolver, edges, vertex_areas
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, load_model, save_model
+from workers.scape.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.skin import separated
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -27,6 +29,8 @@ class TrainingPlan:
     poses: int = 1500
     components: int = 160
     seed: int = 0
+    residual_bodies: int = 60
+    """Validation bodies from which the residual's noise is estimated."""
 
 
 _WEIGHTS_KEPT = 6
@@ -50,8 +54,9 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     bodies = database.vertices(shapes).astype(np.float32)
     bodies -= bodies.mean(axis=1, keepdims=True)
     mean = bodies.mean(axis=0, dtype=np.float64)
-    symmetry = symmetry_map(mean)
+    symmetry = database.symmetry
     mean = 0.5 * (mean + mean[symmetry] * (-1.0, 1.0, 1.0))
+    mean = separated(mean, database.faces, symmetry)
     ground = mean[:, 2].min()
     solver = EdgeSolver.build(mean, database.faces)
     progress("shape components", 0.2)
@@ -59,7 +64,6 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     # Where a body stands is the translation's business alone: the pelvis' centroid stays put.
     pelvis = database.part_weights[:, 0] * vertex_areas(mean, database.faces)
     directions -= np.einsum("p,jpc->jc", pelvis / pelvis.sum(), directions)[:, None]
-    joints = database.neutral_joints(shapes).mean(axis=0)
     mean = mean - (0.0, 0.0, ground)
     names = list(PARTS)
     parents = np.array([-1 if p is None else names.index(p) for p, _ in PARTS.values()], np.int32)
@@ -70,7 +74,6 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
         "part_parents": parents,
         "weight_parts": part_columns.astype(np.uint8),
         "weights": weights.astype(np.float32),
-        "joints": joints,
         "symmetry": symmetry,
         **_packed_directions(directions),
         "vertex_sigma": np.full(len(mean), 2e-3),
@@ -192,12 +195,14 @@ def _ridge(design: Array, target: NDArray[np.float32], strength: float) -> Array
 
 
 def _residual_sigma(model: BodyModel, database: BodyDatabase, plan: TrainingPlan) -> Array:
-    """Root mean square (P,) of what the model leaves out on 100 validation bodies in poses."""
-    shapes = database.sample("validation", 100, plan.seed)
-    bodies = database.vertices(shapes, database.sample_poses("validation", 100, plan.seed))
+    """Root mean square (P,) of what the model leaves out on validation bodies in poses."""
+    shapes = database.sample("validation", plan.residual_bodies, plan.seed)
+    poses = database.sample_poses("validation", plan.residual_bodies, plan.seed)
+    bodies = database.vertices(shapes, poses)
+    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     squares = np.zeros(model.vertex_count)
     for body in bodies:
-        squares += np.square(model.vertices(model.project(body)) - body).sum(axis=1)
+        squares += np.square(model.vertices(best_fit(model, samples, body)) - body).sum(axis=1)
     return np.sqrt(squares / (3 * len(bodies)))
 
 

@@ -1,0 +1,83 @@
+"""The body model on bodies and poses that it was not learned from, and how it is learned."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workers.scape.cache import FOLDER_VARIABLE
+from workers.scape.model import BodyModel, load_model
+from workers.scape.projection import PROJECTION_STRIDE, best_fit
+
+pytest.importorskip("anny", reason="the generator of bodies comes with the train extra")
+
+from workers.scape.database import POPULATION, BodyDatabase
+from workers.scape.train import TrainingPlan, train
+
+BODIES = 5
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def database() -> BodyDatabase:
+    return BodyDatabase()
+
+
+def _rms_m(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
+    """Vertex rms of each body after the best fit of pose and shape."""
+    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    fitted = [model.vertices(best_fit(model, samples, body)) for body in bodies]
+    return np.sqrt(np.mean(np.sum((np.array(fitted) - bodies) ** 2, axis=2), axis=1))
+
+
+def test_held_out_bodies_are_found(model: BodyModel, database: BodyDatabase) -> None:
+    shapes = database.sample("test", BODIES, 21)
+    neutral = _rms_m(model, database.vertices(shapes))
+    assert neutral.mean() < 0.0015
+    assert neutral.max() < 0.003
+    posed = database.vertices(shapes, database.sample_poses("test", BODIES, 21))
+    with_q = _rms_m(model, posed).mean()
+    rigid = replace(
+        model, pose_fields=np.zeros_like(model.pose_fields), sha256=f"{model.sha256} rigid"
+    )
+    assert with_q < 0.002
+    assert with_q < 0.8 * _rms_m(rigid, posed).mean()
+
+
+def test_the_shipped_template_is_the_database_s(model: BodyModel, database: BodyDatabase) -> None:
+    assert np.array_equal(model.faces, database.faces)
+    assert np.array_equal(model.symmetry, database.symmetry)
+
+
+def test_splits_share_no_body_and_sizes_follow_the_population(database: BodyDatabase) -> None:
+    people = {split: database.sample(split, 40, 0) for split in ("train", "validation", "test")}
+    weights = [set(shapes.phenotypes["weight"].tolist()) for shapes in people.values()]
+    assert not weights[0] & weights[1]
+    assert not weights[0] & weights[2]
+    assert not weights[1] & weights[2]
+    stature, mass_index = database.sizes(people["train"])
+    female = people["train"].phenotypes["gender"] > 0.5
+    for sex, chosen in ((POPULATION["women"], female), (POPULATION["men"], ~female)):
+        assert chosen.sum() > 8
+        assert abs(stature[chosen].mean() - sex.stature_m) < 0.05
+        assert abs(np.median(mass_index[chosen]) - sex.mass_index) < 4.0
+
+
+def test_a_seed_learns_the_same_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "cache"))
+    plan = TrainingPlan(bodies=40, poses=20, components=8, residual_bodies=2)
+    said = []
+    for name in ("one.npz", "two.npz"):
+        train(tmp_path / name, plan, lambda step, share: said.append((share, step)))
+    assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
+    small = load_model(tmp_path / "one.npz")
+    assert small.beta_count == 8
+    assert said[-1] == (1.0, "done")
+    other = TrainingPlan(bodies=40, poses=20, components=8, seed=1, residual_bodies=2)
+    train(tmp_path / "other.npz", other, lambda *_: None)
+    assert not np.allclose(load_model(tmp_path / "other.npz").mean, small.mean, atol=1e-4)

@@ -1,0 +1,186 @@
+"""Measures a true body for the benchmark, sharing with the product's measuring only the written
+definitions: the table of rows, the landmarks' vertices, the parts' names.
+
+Everything is done another way. A plane cuts whole triangles into segments; a tape around them is
+as long as the mean of the section's widths over all directions times pi (Cauchy's formula for
+convex curves); a tape over the skin follows the envelope of the section above its chord.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.measure.definitions import (
+    DEFINITIONS,
+    Definition,
+    Drop,
+    Level,
+    Route,
+    Section,
+    Square,
+    Tilted,
+    Top,
+)
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+
+_DIRECTIONS = 720
+_STEP_M = 2.5e-4
+_SAME_POINT_M = 1e-6
+_BELOW, _ABOVE = 0.10, 0.45
+
+
+class TrueBody:
+    """One body (P, 3) with the template's landmarks and parts."""
+
+    def __init__(self, model: BodyModel, vertices: Array) -> None:
+        self._v = vertices
+        self._faces = model.faces
+        self._at = {name: vertices[index] for name, index in model.landmarks.items()}
+        self._vertex_of = model.landmarks
+        self._part = np.array(model.part_names)[model.part_of_vertex]
+
+    def values(self) -> dict[str, float]:
+        """Row -> metres; "volume" in cubic metres and "surface" in square metres."""
+        found = {row.name: self._value(row) for row in DEFINITIONS}
+        a, b, c = (self._v[self._faces[:, i]] for i in range(3))
+        found["volume"] = float(np.linalg.det(np.stack([a, b, c], axis=1)).sum() / 6.0)
+        sides = [np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))]
+        half = sum(sides) / 2.0
+        square = half * (half - sides[0]) * (half - sides[1]) * (half - sides[2])
+        found["surface"] = float(np.sqrt(np.maximum(square, 0.0)).sum())
+        return found
+
+    def _value(self, row: Definition) -> float:
+        way = row.way
+        if isinstance(way, Top):
+            return float(self._v[self._part == way.part, 2].max())
+        if isinstance(way, Drop):
+            return max(0.0, float(self._at[way.upper][2] - self._at[way.lower][2]))
+        if isinstance(way, Route):
+            return self._route(way)
+        return self._section(row, way)
+
+    def _section(self, row: Definition, way: Section) -> float:
+        point, normal = self._plane(way.plane)
+        segments = self._segments(point, normal, way.parts)
+        if not way.whole:
+            segments = _nearest_chain(segments, point)
+        points = segments.reshape(-1, 3)
+        if way.across is None:
+            helper = np.eye(3)[np.argmin(np.abs(normal))]
+            x = np.cross(normal, helper)
+            x /= np.linalg.norm(x)
+            y = np.cross(normal, x)
+            angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+            reach = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
+            return float(np.pi * np.ptp(reach, axis=0).mean())
+        side, other = way.across
+        across = self._at[other] - self._at[side]
+        across = across - normal * (normal @ across)
+        across /= np.linalg.norm(across)
+        if row.quantity == "depth":
+            across = np.cross(normal, across)
+        return float(np.ptp(points @ across))
+
+    def _plane(self, plane: Level | Square | Tilted) -> tuple[Array, Array]:
+        at = self._at
+        if isinstance(plane, Level):
+            start = sum(at[name] for name in plane.landmarks) / len(plane.landmarks)
+            if plane.towards:
+                end = sum(at[name] for name in plane.towards) / len(plane.towards)
+                start = (1.0 - plane.share) * start + plane.share * end
+            return start, np.array([0.0, 0.0, 1.0])
+        if isinstance(plane, Square):
+            line = at[plane.end] - at[plane.start]
+            through = at[plane.at] if plane.at else at[plane.start] + plane.share * line
+            return through, line / np.sqrt(line @ line)
+        normal = np.cross(at[plane.back] - at[plane.front], at[plane.other_side] - at[plane.side])
+        return at[plane.front], normal / np.sqrt(normal @ normal)
+
+    def _segments(self, point: Array, normal: Array, parts: tuple[str, ...]) -> Array:
+        """Where a plane cuts the triangles of some parts: (n, 2, 3)."""
+        mine = np.isin(self._part, parts)[self._faces].all(axis=1)
+        corners = self._v[self._faces[mine]]
+        height = (corners - point) @ normal
+        above = height >= 0.0
+        cut = above.any(axis=1) & ~above.all(axis=1)
+        corners, height, above = corners[cut], height[cut], above[cut]
+        # The corner that is alone on its side, and the two others.
+        alone = np.where(above.sum(axis=1) == 1, np.argmax(above, axis=1), np.argmin(above, axis=1))
+        index = np.arange(len(alone))
+        ends = []
+        for step in (1, 2):
+            other = (alone + step) % 3
+            share = height[index, alone] / (height[index, alone] - height[index, other])
+            start = corners[index, alone]
+            ends.append(start + share[:, None] * (corners[index, other] - start))
+        return np.stack(ends, axis=1)
+
+    def _route(self, way: Route) -> float:
+        names = list(way.landmarks) + ([way.landmarks[0]] if way.closed else [])
+        total = 0.0
+        for index, leg in enumerate(way.legs):
+            if leg == "floor":
+                total += float(self._at[names[index]][2])
+            elif leg == "straight":
+                total += float(np.linalg.norm(self._at[names[index + 1]] - self._at[names[index]]))
+            else:
+                total += self._over(names[index], names[index + 1], way.parts, leg == "tape")
+        return total
+
+    def _over(self, start: str, end: str, parts: tuple[str, ...], taut: bool) -> float:
+        a, b = self._at[start], self._at[end]
+        outward = self._normal(start) + self._normal(end)
+        length = float(np.linalg.norm(b - a))
+        along = (b - a) / length
+        up = outward - along * (along @ outward)
+        up /= np.linalg.norm(up)
+        segments = self._segments(a, np.cross(along, up), parts)
+        x, y = (segments - a) @ along, (segments - a) @ up
+        grid = np.arange(0.0, length, _STEP_M)
+        envelope = np.full(len(grid), -np.inf)
+        for (x0, x1), (y0, y1) in zip(x, y, strict=True):
+            if x1 < x0:
+                x0, x1, y0, y1 = x1, x0, y1, y0
+            inside = slice(*np.searchsorted(grid, (x0, x1)))
+            heights = np.interp(grid[inside], (x0, x1), (y0, y1))
+            heights[(heights <= -_BELOW * length) | (heights >= _ABOVE * length)] = -np.inf
+            envelope[inside] = np.maximum(envelope[inside], heights)
+        seen = np.isfinite(envelope)
+        line = np.stack([grid[seen], envelope[seen]], axis=1)
+        line = np.concatenate([[[0.0, 0.0]], line, [[length, 0.0]]])
+        if not taut:
+            return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+        # A taut tape: the shortest way that stays above, by relaxing towards the chord from above.
+        angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+        line[:, 1] = np.maximum(line[:, 1], 0.0)
+        reach = np.outer(line[:, 0], np.cos(angle)) + np.outer(line[:, 1], np.sin(angle))
+        return float(np.pi * np.ptp(reach, axis=0).mean()) - length
+
+    def _normal(self, landmark: str) -> Array:
+        """Area-weighted, of the triangles around a landmark."""
+        around = self._faces[(self._faces == self._vertex_of[landmark]).any(axis=1)]
+        a, b, c = (self._v[around[:, i]] for i in range(3))
+        total = np.cross(b - a, c - a).sum(axis=0)
+        return np.asarray(total / np.sqrt(total @ total))
+
+
+def _nearest_chain(segments: Array, point: Array) -> Array:
+    """The segments that hang together with the one nearest to a point."""
+    keys = np.round(segments / _SAME_POINT_M).astype(np.int64)
+    ends: dict[tuple[int, ...], list[int]] = {}
+    for index, pair in enumerate(keys):
+        for key in pair:
+            ends.setdefault(tuple(key.tolist()), []).append(index)
+    start = int(np.argmin(np.linalg.norm(segments.mean(axis=1) - point, axis=1)))
+    reached, open_ends = {start}, [start]
+    while open_ends:
+        for key in keys[open_ends.pop()]:
+            for neighbour in ends[tuple(key.tolist())]:
+                if neighbour not in reached:
+                    reached.add(neighbour)
+                    open_ends.append(neighbour)
+    return segments[sorted(reached)]

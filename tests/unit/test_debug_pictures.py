@@ -1,0 +1,62 @@
+"""reconstruct fit --debug: a picture of each stage, and the same result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from workers.debug_pictures import DebugPictures
+from workers.fit_cli import fit
+from workers.render import BACKGROUND
+from workers.scape.deformation import vertex_normals
+from workers.scape.model import BodyModel, load_model
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+def _ink(path: Path) -> float:
+    picture = cv2.imread(str(path))
+    assert picture is not None, path
+    return float((picture != BACKGROUND).any(axis=2).mean())
+
+
+def test_the_error_map_shows_where_the_points_lie(model: BodyModel, tmp_path: Path) -> None:
+    draw = DebugPictures(tmp_path / "pictures", model.faces)
+    draw("cloud", {"points": model.mean, "normals": vertex_normals(model.mean, model.faces)})
+    reddest = []
+    for name, chest_m in (("met", 0.0), ("outside", 0.004), ("inside", -0.004)):
+        residual = np.zeros(model.vertex_count)
+        residual[model.part_of_vertex == model.part_names.index("chest")] = chest_m
+        residual[model.part_of_vertex == model.part_names.index("shin_left")] = np.nan
+        draw("surface", {"vertices": model.mean, "residual_m": residual})
+        picture = cv2.imread(str(tmp_path / "pictures/5-surface.png")).astype(int)
+        blue, green, red = picture[40:].reshape(-1, 3).T
+        reddest.append((name, int((red - blue > 60).sum()), int((blue - red > 60).sum())))
+        assert green.min() < 200
+    (_, *met), (_, red, none), (_, nothing, blue_) = reddest
+    assert met == [0, 0]
+    assert none == nothing == 0
+    assert min(red, blue_) > 2000
+
+
+def test_every_stage_is_drawn(bundle: Path, tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    words = [str(bundle), "--out", str(tmp_path / "out"), "--debug", str(pictures), "--quiet"]
+    done = CliRunner().invoke(fit, words, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    names = sorted(path.name for path in pictures.iterdir())
+    rounds = [name for name in names if name.startswith("3-correspondences-")]
+    assert len(rounds) >= 5
+    others = ["1-cloud.png", "2-start.png", "4-joint.png", "5-surface.png", "6-done.png"]
+    assert [name for name in names if name not in rounds] == others
+    for name in names:
+        assert 0.08 < _ink(pictures / name) < 0.6, name
+    # Pictures of a body are as private as its scan.
+    assert pictures.stat().st_mode & 0o077 == 0

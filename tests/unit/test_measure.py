@@ -1,0 +1,274 @@
+"""The table of measurements on bodies of the model itself: no fit, no noise."""
+
+import csv
+import importlib.util
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from station.errors import InputError
+from station.geometry import so3_exp
+from workers.export.meshes import obj_mesh, ply_mesh
+from workers.export.result import measurements_document
+from workers.measure.body import measure_body, measure_standing
+from workers.measure.cli import measure
+from workers.measure.definitions import DEFINITIONS, Route, Section
+from workers.measure.intervals import ErrorModel, learned, shipped, sides_pooled
+from workers.measure.sections import loop_length
+from workers.measure.standing import on_both_feet, standard_state
+from workers.measure.tracing import trace_all
+from workers.scape.landmarks import find_landmarks
+from workers.scape.model import BodyModel, BodyState, load_model
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+def _body(model: BodyModel, seed: int = 0, pose_deg: float = 5.0) -> tuple[BodyState, np.ndarray]:
+    """A random body near the neutral pose, on the floor."""
+    rng = np.random.default_rng(seed)
+    twists = np.radians(pose_deg) * np.clip(rng.standard_normal((model.part_count, 3)), -2, 2)
+    twists[0] = 0.0
+    state = replace(
+        model.neutral_state(),
+        beta=0.8 * rng.standard_normal(model.beta_count),
+        rotations=model.absolute_rotations(twists),
+    )
+    vertices = on_both_feet(model, model.vertices(state))
+    lift = vertices[0, 2] - model.vertices(state)[0, 2]
+    return replace(state, translation=state.translation + np.array([0.0, 0.0, lift])), vertices
+
+
+def _values(model: BodyModel, vertices: np.ndarray) -> dict[str, float]:
+    return {row.name: row.value_m for row in measure_body(model, vertices).rows}
+
+
+def _true_measurements() -> ModuleType:
+    path = Path(__file__).parents[1] / "bench/true_measurements.py"
+    spec = importlib.util.spec_from_file_location("true_measurements", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_table_names_only_what_the_model_has(model: BodyModel) -> None:
+    assert len({definition.name for definition in DEFINITIONS}) == len(DEFINITIONS) >= 60
+    for definition in DEFINITIONS:
+        if isinstance(definition.way, Section | Route):
+            assert set(definition.way.parts) <= set(model.part_names)
+    rows = {sides_pooled(definition.name) for definition in DEFINITIONS} | {"volume", "surface"}
+    for models in shipped().values():
+        assert rows == set(models)
+
+
+def test_the_model_carries_the_landmarks_that_the_rules_find(model: BodyModel) -> None:
+    found = find_landmarks(model.mean, list(model.part_names), model.part_of_vertex)
+    assert found == model.landmarks
+
+
+def test_landmarks_lie_where_surveys_find_them(model: BodyModel) -> None:
+    """Shares of the stature, ANSUR II, men and women averaged; 2 % of the stature is tolerated."""
+    stature = np.ptp(model.mean[:, 2])
+    for landmark, share in {
+        "cervicale": 0.864, "acromion_left": 0.821, "suprasternale": 0.818, "bust_left": 0.722,
+        "waist_front": 0.632, "buttock_left": 0.505, "crotch": 0.476, "knee_left": 0.285,
+        "ankle_left": 0.040,
+    }.items():  # fmt: skip
+        height = model.mean[model.landmarks[landmark], 2] / stature
+        assert height == pytest.approx(share, abs=0.02), landmark
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_independent_measuring_finds_the_same(model: BodyModel, seed: int) -> None:
+    _, vertices = _body(model, seed)
+    truth = _true_measurements().TrueBody(model, vertices).values()
+    for name, value in _values(model, vertices).items():
+        assert value == pytest.approx(truth[name], abs=5e-4), name
+    measured = measure_body(model, vertices)
+    assert measured.volume_m3.value == pytest.approx(truth["volume"], rel=1e-6)
+    assert measured.surface_m2.value == pytest.approx(truth["surface"], rel=1e-6)
+
+
+def test_left_and_right_of_the_symmetric_body_agree(model: BodyModel) -> None:
+    values = _values(model, model.mean)
+    for name in values:
+        if name.endswith("_left"):
+            other = name.removesuffix("_left") + "_right"
+            assert values[name] == pytest.approx(values[other], abs=1e-3), name
+
+
+def test_a_larger_body_measures_more_in_proportion(model: BodyModel) -> None:
+    small, large = _values(model, model.mean), _values(model, 1.1 * model.mean)
+    for name, value in small.items():
+        assert large[name] == pytest.approx(1.1 * value, rel=1e-6), name
+    volumes = [measure_body(model, k * model.mean).volume_m3.value for k in (1.0, 1.1)]
+    assert volumes[1] == pytest.approx(1.1**3 * volumes[0], rel=1e-6)
+
+
+def test_values_do_not_depend_on_where_the_person_stands(model: BodyModel) -> None:
+    turned = model.mean @ so3_exp([0.0, 0.0, 0.4]).T + (0.2, -0.1, 0.0)
+    here, there = _values(model, model.mean), _values(model, turned)
+    for name, value in here.items():
+        assert there[name] == pytest.approx(value, abs=1e-6), name
+
+
+def test_arms_never_count_to_the_trunk(model: BodyModel) -> None:
+    """With arms that touch the hips, a plane cuts hands and trunk at one level."""
+    state = standard_state(model, np.zeros(model.beta_count))
+    low = on_both_feet(model, model.vertices(state))
+    high = on_both_feet(model, model.vertices(model.neutral_state()))
+    near, far = _values(model, low), _values(model, high)
+    for name in ("waist_girth", "high_hip_girth", "hip_girth"):
+        assert near[name] == pytest.approx(far[name], rel=0.03), name
+
+
+def test_a_girth_is_as_long_as_its_path(model: BodyModel) -> None:
+    _, vertices = _body(model, 3)
+    for row in measure_body(model, vertices).rows:
+        if row.closed:
+            assert loop_length(row.path, closed=True) == pytest.approx(row.value_m, rel=1e-9)
+
+
+def test_standing_takes_the_scanned_pose_away(model: BodyModel) -> None:
+    """The same person in two stances has one table in the standard pose."""
+    tables = []
+    for pose_deg in (0.0, 4.0):
+        state, vertices = _body(model, 4, pose_deg)
+        state = replace(state, beta=_body(model, 4, 0.0)[0].beta)
+        vertices = model.vertices(state)
+        rows = measure_standing(model, vertices, state).rows
+        tables.append({row.name: row.value_m for row in rows})
+    for name, value in tables[0].items():
+        assert tables[1][name] == pytest.approx(value, abs=0.006), name
+
+
+def test_the_standard_pose(model: BodyModel) -> None:
+    body = on_both_feet(model, model.vertices(standard_state(model, np.zeros(model.beta_count))))
+    at = {name: body[index] for name, index in model.landmarks.items()}
+    for side in ("left", "right"):
+        arm = at[f"wrist_{side}"] - at[f"acromion_{side}"]
+        from_trunk = np.degrees(np.arctan2(np.hypot(*arm[:2]), -arm[2]))
+        assert from_trunk == pytest.approx(20.0, abs=2.0)
+        bend = (
+            at[f"elbow_{side}"] - at[f"acromion_{side}"],
+            at[f"wrist_{side}"] - at[f"elbow_{side}"],
+        )
+        cosine = bend[0] @ bend[1] / np.linalg.norm(bend[0]) / np.linalg.norm(bend[1])
+        assert np.degrees(np.arccos(cosine)) < 6.0
+    assert at["heel_left"][0] - at["heel_right"][0] == pytest.approx(0.2, abs=0.03)
+    assert abs(body[:, 2].min()) < 2e-3
+
+
+def test_standing_lines_lie_on_the_scanned_mesh(model: BodyModel) -> None:
+    state, vertices = _body(model, 5)
+    rows = {row.name: row for row in measure_standing(model, vertices, state).rows}
+    path = rows["waist_girth"].path
+    waist = vertices[model.landmarks["waist_front"]]
+    assert np.abs(path[:, 2] - waist[2]).max() < 0.03
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    assert ((path >= low) & (path <= high)).all()
+
+
+def test_intervals_hold_what_they_promise() -> None:
+    """Errors whose size the posterior knows in part: narrow where it is sure, 95 of 100 held."""
+    rng = np.random.default_rng(0)
+
+    def draw(count: int) -> tuple[np.ndarray, np.ndarray]:
+        sigmas = rng.uniform(0.5e-3, 3e-3, count)
+        return 2e-3 + np.hypot(1e-3, 2.0 * sigmas) * rng.standard_normal(count), sigmas
+
+    found = learned(*draw(400))
+    errors, sigmas = draw(4000)
+    ends = np.array([found.interval(1.0 + e, s) for e, s in zip(errors, sigmas, strict=True)])
+    held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
+    assert 0.93 < held.mean() < 0.975
+    width = ends[:, 1] - ends[:, 0]
+    assert width[sigmas > 2.5e-3].mean() > 2.0 * width[sigmas < 1e-3].mean()
+    assert found.bias == pytest.approx(2e-3, abs=6e-4)
+
+
+def test_chance_does_not_pass_for_a_systematic_error() -> None:
+    errors = np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10)
+    assert learned(errors, np.full(40, 1e-3)).bias == 0.0
+
+
+def test_an_interval_holds_its_value() -> None:
+    low, high = ErrorModel(bias=-8e-3, constant=5e-3, gain=0.0).interval(0.4, 0.0)
+    assert low == 0.4
+    assert high == pytest.approx(0.413)
+
+
+def test_a_poorly_seen_body_gets_wider_intervals(model: BodyModel) -> None:
+    sharp = measure_body(model, model.mean, np.full(model.vertex_count, 3e-4))
+    blurred = measure_body(model, model.mean, np.full(model.vertex_count, 4e-3))
+    widths = [
+        np.mean([row.interval95_m[1] - row.interval95_m[0] for row in body.rows])
+        for body in (sharp, blurred)
+    ]
+    assert widths[1] > 1.1 * widths[0]
+
+
+def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
+    flat = model.mean * (1.0, 1.0, 0.0)
+    with pytest.raises(InputError, match="cannot be measured"):
+        trace_all(model, flat)
+
+
+def _run(*words: str) -> str:
+    done = CliRunner().invoke(measure, list(words), catch_exceptions=False)
+    assert done.exit_code == 0
+    return done.output
+
+
+def test_meshes_are_measured_without_a_fit(model: BodyModel, tmp_path: Path) -> None:
+    (tmp_path / "mesh.ply").write_bytes(ply_mesh(model.mean, model.faces))
+    (tmp_path / "mesh.obj").write_bytes(obj_mesh(model.mean, model))
+    values = _values(model, model.mean)
+    for name in ("mesh.ply", "mesh.obj"):
+        document = json.loads(_run(str(tmp_path / name), "--json"))
+        for row in document["measurements"]:
+            assert row["value_m"] == pytest.approx(values[row["name"]], abs=1e-3), row["name"]
+            assert row["interval95_m"] == [row["value_m"]] * 2
+    table = _run(str(tmp_path / "mesh.ply"))
+    assert "waist_girth" in table
+    assert "volume" in table
+
+
+def test_a_results_tables_are_printed_with_their_intervals(
+    model: BodyModel, tmp_path: Path
+) -> None:
+    sigma = np.full(model.vertex_count, 1e-3)
+    state = model.neutral_state()
+    for name, body in (
+        ("measurements.json", measure_body(model, model.mean, sigma)),
+        ("measurements-standard.json", measure_standing(model, model.mean, state, sigma)),
+    ):
+        (tmp_path / name).write_text(json.dumps(measurements_document("s1", body)))
+    rows = list(csv.DictReader(io.StringIO(_run(str(tmp_path), "--csv", "--pose", "standard"))))
+    assert {row["unit"] for row in rows} == {"m", "m3", "m2"}
+    assert all(float(row["low"]) < float(row["value"]) < float(row["high"]) for row in rows[:9])
+    assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
+    assert "s1, pose as-scanned" in _run(str(tmp_path))
+
+
+def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_path: Path) -> None:
+    (tmp_path / "cut.ply").write_bytes(ply_mesh(model.mean, model.faces[:-5]))
+    (tmp_path / "text.obj").write_text("v one two three\n")
+    for source, words in (
+        ("cut.ply", "fit it first"),
+        ("text.obj", "no usable mesh"),
+        ("missing.ply", "not a file"),
+        (".", "has no measurements.json"),
+    ):
+        with pytest.raises(InputError, match=words):
+            CliRunner().invoke(measure, [str(tmp_path / source)], catch_exceptions=False)

@@ -1,0 +1,94 @@
+"""Pictures without a display: what is where, and the preview's labels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pytest
+
+from workers.export.preview import _spread, preview
+from workers.measure.body import Measurement, measure_body
+from workers.render import BACKGROUND, Frame, Scene
+from workers.scape.model import BodyModel, load_model
+from workers.scape.verdict import Verdict
+
+OK = Verdict("ok", ())
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def rows(model: BodyModel) -> list[Measurement]:
+    return list(measure_body(model, model.mean, np.full(model.vertex_count, 1e-3)).rows)
+
+
+@pytest.mark.parametrize(
+    ("view", "ball", "where"),
+    [
+        ("front", (0.4, 0.0, 1.3), (89.5, 19.5)),
+        ("back", (0.4, 0.0, 1.3), (9.5, 19.5)),
+        ("side", (0.0, 0.4, 1.3), (89.5, 19.5)),
+        ("side", (0.0, -0.4, 0.6), (9.5, 89.5)),
+    ],
+)
+def test_a_ball_off_the_centre_is_where_it_should_be(
+    view: str, ball: tuple[float, float, float], where: tuple[float, float]
+) -> None:
+    """A camera helper's natural "up" once turned every picture by 180 degrees."""
+    sphere = o3d.geometry.TriangleMesh.create_sphere(0.05).translate(ball)
+    frame = Frame(view, 100, 100, 0.01, (0.0, 0.0, 1.0))
+    shown = Scene(np.asarray(sphere.vertices), np.asarray(sphere.triangles)).render(frame)
+    v, u = np.nonzero(np.isfinite(shown.depth_m))
+    assert np.allclose((u.mean(), v.mean()), where, atol=0.6)
+    assert np.allclose(frame.pixels(np.array([ball])), where)
+    nearest = frame.depths(np.array([ball]))[0] - 0.05
+    assert shown.depth_m.min() == pytest.approx(nearest, abs=2e-3)
+    assert (shown.picture[~np.isfinite(shown.depth_m)] == BACKGROUND).mean() > 0.97
+
+
+def test_triangles_take_their_colours() -> None:
+    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 0, 2], [-1, 0, 2]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    colors = np.array([[0.0, 0.0, 255.0], [255.0, 0.0, 0.0]])
+    frame = Frame("front", 50, 50, 0.03, (0.0, 0.0, 1.0))
+    picture = Scene(square, faces).render(frame, colors).picture
+    assert picture[40, 40, 2] > 150 > 10 > picture[40, 40, 0]
+    assert picture[10, 10, 0] > 150 > 10 > picture[10, 10, 2]
+
+
+def _decoded(content: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_labels_keep_clear_of_the_body_and_of_each_other(
+    model: BodyModel, rows: list[Measurement]
+) -> None:
+    """Values once stood on the arms, and on top of each other."""
+    bare = _decoded(preview(model.mean, model.faces, [], OK))
+    assert bare.min() < 200
+    # Two dozen lines that all end at one height have labels of their own all the same.
+    crowded = _spread(np.full(12, 300.0), 24.0, 24.0, 500.0)
+    assert np.diff(crowded).min() >= 24.0
+    assert crowded[0] >= 24.0
+    assert crowded[-1] <= 500.0
+    picture = _decoded(preview(model.mean, model.faces, rows, OK))
+    assert picture.shape[1] > bare.shape[1] + 400
+
+
+def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]) -> None:
+    good = _decoded(preview(model.mean, model.faces, rows, OK))
+    verdict = Verdict("rescan", ("left forearm not seen (12 % of it)", "x" * 1000))
+    again = _decoded(preview(model.mean, model.faces, rows, verdict))
+    assert (good[-30:] == BACKGROUND).all()
+    assert (again[-30:] != BACKGROUND).any()
+    assert np.array_equal(again[:-34], good[:-34])
+    assert (again[:, -10:][-30:] == BACKGROUND).all()
+
+
+def test_a_row_that_is_not_measured_is_left_out(model: BodyModel, rows: list[Measurement]) -> None:
+    some = [row for row in rows if row.name != "waist_girth"]
+    assert len(preview(model.mean, model.faces, some, OK)) > 1000

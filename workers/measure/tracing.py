@@ -1,0 +1,182 @@
+"""Follows the definitions over a body in the template's topology: each row's line and value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.errors import InputError
+from workers.measure.definitions import (
+    DEFINITIONS,
+    Definition,
+    Drop,
+    Level,
+    Route,
+    Section,
+    Square,
+    Tilted,
+    Top,
+)
+from workers.measure.sections import (
+    EdgeNet,
+    EdgePoints,
+    Index,
+    hull_order,
+    loop_length,
+    plane_axes,
+    surface_order,
+)
+from workers.scape.deformation import vertex_normals
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """The line of one measurement."""
+
+    definition: Definition
+    value_m: float
+    points: EdgePoints
+    closed: bool
+    to_floor: bool
+    """The line goes on from its last point straight down to the floor."""
+
+    def path(self, vertices: Array) -> Array:
+        """The line (n, 3) on a body (P, 3) of the same topology."""
+        found = self.points.on(vertices)
+        if self.to_floor:
+            found = np.concatenate([found, found[-1:] * (1.0, 1.0, 0.0)])
+        return found
+
+
+def trace_all(model: BodyModel, vertices: Array) -> list[Trace]:
+    """Every row of the table on a body (P, 3), z up, the floor at 0.
+
+    Raises:
+        InputError: a plane misses the part of the body that it should cut.
+    """
+    tracer = _Tracer(model, vertices)
+    return [tracer.trace(definition) for definition in DEFINITIONS]
+
+
+@lru_cache(maxsize=64)
+def _net(model: BodyModel, parts: tuple[str, ...]) -> EdgeNet:
+    wanted = [model.part_names.index(part) for part in parts]
+    inside = np.isin(model.part_of_vertex, wanted)
+    return EdgeNet.build(model.faces[inside[model.faces].all(axis=1)])
+
+
+class _Tracer:
+    def __init__(self, model: BodyModel, vertices: Array) -> None:
+        self._model = model
+        self._vertices = vertices
+        self._normals = vertex_normals(vertices, model.faces)
+        self._cuts: dict[Section, tuple[EdgePoints, Array]] = {}
+
+    def trace(self, definition: Definition) -> Trace:
+        try:
+            value, points, closed, to_floor = self._follow(definition)
+        except ValueError as cause:
+            raise InputError(
+                f"{definition.name} cannot be measured: {cause}; fit the body again"
+            ) from None
+        return Trace(definition, value, points, closed, to_floor)
+
+    def _follow(self, definition: Definition) -> tuple[float, EdgePoints, bool, bool]:
+        match definition.way:
+            case Section() as section:
+                value, points, closed = self._section(definition, section)
+                return value, points, closed, False
+            case Route() as route:
+                points = self._route(route)
+                to_floor = route.legs[-1] == "floor"
+                line = points.on(self._vertices)
+                value = loop_length(line, closed=route.closed)
+                return value + (line[-1, 2] if to_floor else 0.0), points, route.closed, to_floor
+            case Top(part):
+                index = np.flatnonzero(
+                    self._model.part_of_vertex == self._model.part_names.index(part)
+                )
+                top = int(index[np.argmax(self._vertices[index, 2])])
+                return float(self._vertices[top, 2]), EdgePoints.at([top]), False, True
+            case Drop(upper, lower):
+                drop = max(0.0, float(self._at(upper)[2] - self._at(lower)[2]))
+                ends = EdgePoints.at([self._model.landmarks[upper], self._model.landmarks[lower]])
+                return drop, ends, False, False
+
+    def _at(self, landmark: str) -> Array:
+        return self._vertices[self._model.landmarks[landmark]]
+
+    def _mean(self, landmarks: tuple[str, ...]) -> Array:
+        return np.mean([self._at(landmark) for landmark in landmarks], axis=0)
+
+    def _plane(self, plane: Level | Square | Tilted) -> tuple[Array, Array]:
+        """A point of a plane, near what it is to cut, and its normal."""
+        match plane:
+            case Level(landmarks, towards, share):
+                point = self._mean(landmarks)
+                if towards:
+                    point = point + share * (self._mean(towards) - point)
+                return point, _UP
+            case Square(start, end, share, at):
+                line = self._at(end) - self._at(start)
+                point = self._at(start) + share * line if at is None else self._at(at)
+                return point, line / np.linalg.norm(line)
+            case Tilted(front, back, side, other):
+                normal = np.cross(
+                    self._at(other) - self._at(side), self._at(back) - self._at(front)
+                )
+                return self._at(front), normal / np.linalg.norm(normal)
+
+    def _cut(self, section: Section) -> tuple[EdgePoints, Array]:
+        """The tape's points of a section and where they are; breadths share it with their girth."""
+        key = Section(section.plane, section.parts, section.whole)
+        if key not in self._cuts:
+            point, normal = self._plane(section.plane)
+            found, piece = _net(self._model, section.parts).cut(self._vertices, point, normal)
+            places = found.on(self._vertices)
+            if not section.whole and len(places):
+                nearest = np.argmin(np.linalg.norm(places - point, axis=1))
+                chosen = np.flatnonzero(piece == piece[nearest])
+                found, places = found.take(chosen), places[chosen]
+            tape = hull_order(places, normal)
+            self._cuts[key] = found.take(tape), places[tape]
+        return self._cuts[key]
+
+    def _section(self, definition: Definition, section: Section) -> tuple[float, EdgePoints, bool]:
+        points, places = self._cut(section)
+        if section.across is None:
+            return loop_length(places, closed=True), points, True
+        side, other = section.across
+        breadth, depth = plane_axes(self._plane(section.plane)[1], self._at(other) - self._at(side))
+        reach = places @ (breadth if definition.quantity == "breadth" else depth)
+        low, high = int(np.argmin(reach)), int(np.argmax(reach))
+        ends = points.take(np.array([low, high]))
+        return float(reach[high] - reach[low]), ends, False
+
+    def _route(self, route: Route) -> EdgePoints:
+        marks = [self._model.landmarks[name] for name in route.landmarks]
+        pieces: list[EdgePoints] = [EdgePoints.at(marks[:1])]
+        ends = marks[1:] + (marks[:1] if route.closed else [])
+        for start, end, leg in zip(marks, ends, route.legs, strict=False):
+            if leg != "straight":
+                pieces.append(self._over_skin(route.parts, start, end, taut=leg == "tape"))
+            pieces.append(EdgePoints.at([end]))
+        if route.closed:
+            pieces.pop()
+        return EdgePoints.joined(pieces)
+
+    def _over_skin(self, parts: tuple[str, ...], start: int, end: int, *, taut: bool) -> EdgePoints:
+        ends = self._vertices[start], self._vertices[end]
+        outward = self._normals[start] + self._normals[end]
+        normal = np.cross(ends[1] - ends[0], outward)
+        normal /= np.linalg.norm(normal)
+        found, _ = _net(self._model, parts).cut(self._vertices, ends[0], normal)
+        order: Index = surface_order(found.on(self._vertices), *ends, outward, taut=taut)
+        return found.take(order)

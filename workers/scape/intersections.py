@@ -1,0 +1,130 @@
+"""A surface that neither crosses itself nor turns a triangle over, by the least motion.
+
+Where the surface left the model's too abruptly (lips, ears, between fingers) it is the offset from
+the model that relaxes, so that the model's own shape stands there, carried by its surroundings.
+Where the model itself overlaps (an arm on the trunk, thighs) the surface relaxes instead: both
+sides of a contact flatten until they part. Patches grow only while they have to.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from workers.scape.crossings import crossing_pairs
+from workers.scape.deformation import Faces, vertex_normals
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_MOST_ROUNDS = 30
+_STUBBORN_ROUNDS = 3
+"""Rounds after which a place no longer counts on the model's own shape."""
+_ROUNDS_A_RING = 4
+_SWEEPS = 8
+_FLATTENING = 0.5
+"""Share of the way to the neighbours' mean that a stubborn vertex goes in one round."""
+
+
+def self_intersections(vertices: Array, faces: Faces) -> int:
+    """How many pairs of triangles cross."""
+    return len(crossing_pairs(vertices, faces))
+
+
+def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
+    """(K,): triangles that look away from where they look on a reference surface (P, 3), and from
+    where their surroundings look."""
+    here = _area_vectors(vertices, faces)
+    around = vertex_normals(vertices, faces)[faces].sum(axis=1)
+    there = _area_vectors(reference, faces)
+    return np.asarray(
+        (np.einsum("ki,ki->k", here, there) <= 0.0) & (np.einsum("ki,ki->k", here, around) <= 0.0)
+    )
+
+
+def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
+    """The surface (P, 3) without crossings and turned triangles.
+
+    Parts that are pushed centimetres into each other, as no body can be, stay so: to flatten them
+    until they part would spoil them.
+
+    Args:
+        vertices: (P, 3), fitted.
+        reference: (P, 3): the model's own surface in the same pose and shape.
+    """
+    faces = model.faces
+    mean = _neighbour_mean(model)
+    current = gentle = vertices
+    trouble = np.zeros(len(vertices), np.int64)
+    asking: Mask = np.ones(len(faces), bool)
+    for round_ in range(_MOST_ROUNDS):
+        bad = turned_over(current, reference, faces)
+        bad[crossing_pairs(current, faces, asking).ravel()] = True
+        if not bad.any():
+            return current
+        if round_ == _STUBBORN_ROUNDS:
+            gentle = current
+        corners = np.zeros(len(vertices), bool)
+        corners[faces[bad]] = True
+        marked = _grown(corners, mean, 1)
+        trouble += marked
+        patch = np.flatnonzero(_grown(marked, mean, 1 + round_ // _ROUNDS_A_RING))
+        current = _relaxed(current, reference, patch, trouble[patch] > _STUBBORN_ROUNDS, mean)
+        moved = np.zeros(len(vertices), bool)
+        moved[patch] = True
+        asking = np.asarray(moved[faces].any(axis=1))
+    hopeless = turned_over(current, reference, faces)
+    hopeless[crossing_pairs(current, faces, asking).ravel()] = True
+    return _restored(current, gentle, np.unique(faces[hopeless]), mean)
+
+
+def _restored(
+    vertices: Array, before: Array, corners: NDArray[np.int32], mean: sp.csr_matrix
+) -> Array:
+    """The surface with those moved places as before that hold one of the corners."""
+    moved = np.flatnonzero((vertices != before).any(axis=1))
+    _, place = connected_components(mean[moved][:, moved], directed=False)
+    back = moved[np.isin(place, place[np.isin(moved, corners)])]
+    restored = vertices.copy()
+    restored[back] = before[back]
+    return restored
+
+
+def _relaxed(
+    vertices: Array, reference: Array, patch: NDArray[np.intp], stubborn: Mask, mean: sp.csr_matrix
+) -> Array:
+    """The surface with a patch' offsets smoothed, and its stubborn vertices flattened."""
+    offset = vertices - reference
+    rows = mean[patch]
+    for _ in range(_SWEEPS):
+        offset[patch] = rows @ offset
+    relaxed = reference + offset
+    flat = patch[stubborn]
+    relaxed[flat] = vertices[flat] + _FLATTENING * (mean[flat] @ vertices - vertices[flat])
+    return relaxed
+
+
+def _grown(mask: Mask, mean: sp.csr_matrix, rings: int) -> Mask:
+    for _ in range(rings):
+        mask = mask | (mean @ mask.astype(np.float64) > 0.0)
+    return mask
+
+
+@lru_cache(maxsize=2)
+def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
+    """(P, P): takes values to the means of their neighbours'."""
+    linked = (model.solver.laplacian != 0).astype(np.float64).tolil()
+    linked.setdiag(0.0)
+    linked = linked.tocsr()
+    linked.eliminate_zeros()
+    return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()
+
+
+def _area_vectors(vertices: Array, faces: Faces) -> Array:
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a))

@@ -1,0 +1,74 @@
+"""What the model costs a process: time to load, time to evaluate, memory."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from workers.scape.cache import FOLDER_VARIABLE
+from workers.scape.model import load_model
+
+SAMPLES = 3000
+_REPEATS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """Seconds and bytes in a process of its own."""
+
+    load_s: float
+    """Of the file and of everything that is derived from it."""
+    body_s: float
+    jacobian_s: float
+    peak_bytes: int
+
+
+def measure_resources(path: Path | None) -> tuple[Resources, Resources]:
+    """With an empty cache and with the filled one, each in a new process."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _in_child(path, folder), _in_child(path, folder)
+
+
+def _in_child(path: Path | None, folder: str) -> Resources:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=1, mp_context=context) as child:
+        return child.submit(_measured, path, folder).result()
+
+
+def _measured(path: Path | None, folder: str) -> Resources:
+    os.environ[FOLDER_VARIABLE] = folder
+    start_s = time.perf_counter()
+    model = load_model(path)
+    samples = model.at(np.linspace(0, model.vertex_count - 1, SAMPLES).astype(np.int64))
+    state = model.neutral_state()
+    model.vertices(state)
+    load_s = time.perf_counter() - start_s
+    body_s = _median_s(lambda: model.vertices(state))
+    jacobian_s = _median_s(lambda: samples.jacobian(state))
+    return Resources(load_s, body_s, jacobian_s, _peak_bytes())
+
+
+def _median_s(call: Callable[[], object]) -> float:
+    call()
+    times = []
+    for _ in range(_REPEATS):
+        start_s = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start_s)
+    return float(np.median(times))
+
+
+def _peak_bytes() -> int:
+    """Highest resident memory of this process alone (getrusage would count its parent's)."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return 1024 * int(line.split()[1])
+    raise OSError("/proc/self/status names no peak of memory")
