@@ -61,7 +61,7 @@ def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
     """Each camera's held-out detections against the other cameras', by a state solved without."""
     start_s = _start(problem)
     tracks = {
-        name: _corrected(seen, state, problem.radius_m) for name, seen in problem.waved.items()
+        name: corrected(seen, state, problem.radius_m) for name, seen in problem.waved.items()
     }
     found = {}
     for name, track in tracks.items():
@@ -101,7 +101,7 @@ def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -
     return points[seen] - total[seen] / count[seen, None]
 
 
-def _corrected(seen: Sightings, state: State, radius_m: float) -> Track:
+def corrected(seen: Sightings, state: State, radius_m: float) -> Track:
     """Detections in the reference frame after depth correction and clock offset."""
     centers = seen.centers.copy()
     for _ in range(4):

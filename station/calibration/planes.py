@@ -34,8 +34,8 @@ _LEAST_SHARE = 0.3
 _FOREGROUND = 0.015
 _LARGEST_SHARE_BEYOND = 0.05
 _FARTHEST_M = 3.2
-_WHOLE_PX = 5
-_LEAST_FRAME_SHARE = 0.15
+_WHOLE_PX = 3
+_LEAST_WHOLE = 2
 
 
 def observe_floor(
@@ -75,8 +75,7 @@ def _whole_mean(stack: NDArray[np.uint16], scale_m: float) -> tuple[Image, Image
         whole = cv2.erode((frame > 0).astype(np.uint8), window)
         total += frame * whole
         count += whole
-    # An average of few frames has few to compare with; as many as there are must be there.
-    usable = count >= max(2, _LEAST_FRAME_SHARE * len(stack))
+    usable = count >= _LEAST_WHOLE
     return (
         np.where(usable, scale_m * total / np.maximum(count, 1), 0.0).astype(np.float32),
         np.where(usable, count, 1.0).astype(np.float32),

@@ -38,7 +38,7 @@ def simulate(
             yield time_s, (TABLE[frame.raw] * np.float32(DEPTH_SCALE_M)).astype(np.float32)
 
     def still(step: str) -> NDArray[np.uint16]:
-        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, _LOOK_S, 1)])
+        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, None, 1)])
         return stack.astype(np.uint16)
 
     empty = still(EMPTY)

@@ -64,8 +64,8 @@ class Row:
     seconds: float
 
 
-def calibrate(seed: int) -> Row:
-    """Simulate, solve and judge one booth."""
+def calibrate(seed: int) -> Row | str:
+    """Simulate, solve and judge one booth; words if it is refused."""
     booth = synthetic.booth(seed)
     procedure = VirtualProcedure(booth)
     cameras = synthetic.factory(booth.rig)
@@ -76,10 +76,13 @@ def calibrate(seed: int) -> Row:
         [one for part in seen for one in part.planes],
     )
     start_s = time.perf_counter()
-    solution = solve(
-        observations, cameras, radius_m=procedure.radius_m, reference=_REFERENCE,
-        front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
-    )  # fmt: skip
+    try:
+        solution = solve(
+            observations, cameras, radius_m=procedure.radius_m, reference=_REFERENCE,
+            front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
+        )  # fmt: skip
+    except CalibrationError as refusal:
+        return f"{seed:<7}refused: {refusal}"
     seconds = time.perf_counter() - start_s
     names, truth = list(cameras), booth.rig.cameras
     errors = []
@@ -131,7 +134,7 @@ def _cylinder(booth: SimulatedBooth, rig: Rig, folder: Path) -> float:
     radius, height = _CYLINDER_M
     shape = o3d.geometry.TriangleMesh.create_cylinder(radius, height, 360, 1)
     mesh = Mesh(
-        np.asarray(shape.vertices) + (0.0, 0.0, height / 2 + 0.05),
+        (*np.asarray(shape.vertices), 0.0, 0.0, height / 2 + 0.05),
         np.asarray(shape.triangles, np.int32),
     )
     points = _cloud(booth, rig, mesh, folder)
@@ -182,11 +185,12 @@ def _bar(text: str, value: float, limit: float, form: str = ".2f") -> None:
     print(f"  {text:<58}{value:>9{form}}  <= {limit:<7g}{verdict}")
 
 
-def summary(rows: Sequence[Row]) -> None:
+def summary(rows: Sequence[Row], booths: int) -> None:
     """The bars."""
     shift = np.concatenate([row.shift_mm for row in rows])
     turn = np.concatenate([row.turn_deg for row in rows])
-    print(f"\n{len(rows)} booths, all six pairs of cameras")
+    print(f"\n{len(rows)} of {booths} booths, all six pairs of cameras")
+    _bar("sound booths refused", booths - len(rows), 0, ".0f")
     _bar("relative poses, mean (mm)", shift.mean(), 1.0)
     _bar("relative poses, worst (mm)", shift.max(), 2.0)
     _bar("relative poses, mean (degrees)", turn.mean(), 0.05, ".3f")
@@ -219,6 +223,9 @@ def main() -> None:
     rows = []
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
         for row in pool.imap(calibrate, seeds):
+            if isinstance(row, str):
+                print(row, flush=True)
+                continue
             rows.append(row)
             print(
                 f"{row.seed:<7}{row.shift_mm.mean():9.2f}{row.shift_mm.max():7.2f}"
@@ -227,7 +234,7 @@ def main() -> None:
                 f"{row.body_true_mm:7.2f}{row.seconds:6.1f}",
                 flush=True,
             )
-    summary(rows)
+    summary(rows, len(seeds))
     refusals()
     if arguments.scans:
         bench_drift.report(arguments.scans, max(10, arguments.scans // 10))
