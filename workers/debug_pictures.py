@@ -17,10 +17,10 @@ from workers.render import (
     Frame,
     Picture,
     Rendering,
+    Scene,
     draw_line,
     draw_points,
     png,
-    render,
     write_text,
 )
 from workers.scape.observer import Stage
@@ -41,6 +41,12 @@ _OUTSIDE, _INSIDE = np.array([60.0, 60.0, 235.0]), np.array([235.0, 120.0, 50.0]
 _MET, _UNSEEN = np.array([225.0, 235.0, 225.0]), np.array([150.0, 150.0, 150.0])
 _CLOSE_M = 0.01
 _BARE_DARK, _BARE_LIGHT = 60.0, 200.0
+_BODY_STAGES = {
+    "start": (2, "start"),
+    "joint": (4, "model fitted (pose and shape)"),
+    "done": (6, "result"),
+}
+"""Stages that are drawn as the body with the cloud over it: number and title."""
 
 
 class DebugPictures:
@@ -61,32 +67,31 @@ class DebugPictures:
         if stage == "cloud":
             self._points, self._normals = arrays["points"].copy(), arrays["normals"].copy()
             self._write("1-cloud", f"cloud: {len(self._points):,} points", self._bare)
-        elif stage == "start":
-            self._write("2-start", "start", lambda frame: self._over(arrays["vertices"], frame))
-        elif stage == "correspondences":
-            self._rounds += 1
-            away = np.linalg.norm(arrays["on_cloud"] - arrays["on_body"], axis=1)
-            middle_mm = 1e3 * float(np.median(away)) if len(away) else float("nan")
-            title = f"round {self._rounds}: {len(away):,} pairs, median {middle_mm:.1f} mm"
-            name = f"3-correspondences-{self._rounds:02d}"
-            self._write(name, title, lambda frame: self._paired(arrays, away, frame))
-        elif stage == "joint":
-            title = "model fitted (pose and shape)"
-            self._write("4-joint", title, lambda frame: self._over(arrays["vertices"], frame))
+            return
+        scene = Scene(arrays["vertices"], self._faces)
+        if stage == "correspondences":
+            self._draw_pairs(scene, arrays["on_body"], arrays["on_cloud"])
         elif stage == "surface":
-            residual = arrays["residual_m"]
-            seen = residual[np.isfinite(residual)]
-            rms_mm = 1e3 * float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
-            limit = f"{1e3 * _WORST_SHOWN_M:.0f} mm"
-            title = f"error: rms {rms_mm:.2f} mm; red: points {limit} outside, blue: inside"
-            colors = self._error_colors(residual)
-            self._write(
-                "5-surface",
-                title,
-                lambda frame: render(arrays["vertices"], self._faces, frame, colors).picture,
-            )
+            self._draw_errors(scene, arrays["residual_m"])
         else:
-            self._write("6-done", "result", lambda frame: self._over(arrays["vertices"], frame))
+            number, title = _BODY_STAGES[stage]
+            self._write(f"{number}-{stage}", title, lambda frame: self._over(scene, frame))
+
+    def _draw_pairs(self, scene: Scene, on_body: Array, on_cloud: Array) -> None:
+        self._rounds += 1
+        away = np.linalg.norm(on_cloud - on_body, axis=1)
+        middle_mm = 1e3 * float(np.median(away)) if len(away) else float("nan")
+        title = f"round {self._rounds}: {len(away):,} pairs, median {middle_mm:.1f} mm"
+        name = f"3-correspondences-{self._rounds:02d}"
+        self._write(name, title, lambda frame: _paired(scene, on_body, on_cloud, frame))
+
+    def _draw_errors(self, scene: Scene, residual_m: Array) -> None:
+        seen = residual_m[np.isfinite(residual_m)]
+        rms_mm = 1e3 * float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
+        limit = f"{1e3 * _WORST_SHOWN_M:.0f} mm"
+        title = f"error: rms {rms_mm:.2f} mm; red: points {limit} outside, blue: inside, grey: none"
+        colors = self._error_colors(residual_m)
+        self._write("5-surface", title, lambda frame: scene.render(frame, colors).picture)
 
     def _frame(self, view: str) -> Frame:
         low, high = np.quantile(self._points, [0.001, 0.999], axis=0)
@@ -112,29 +117,14 @@ class DebugPictures:
         draw_points(picture, frame.pixels(self._points[shown]), colors)
         return picture
 
-    def _over(self, vertices: Array, frame: Frame) -> Picture:
+    def _over(self, scene: Scene, frame: Frame) -> Picture:
         """The body, and the points that it does not hide."""
-        shown = render(vertices, self._faces, frame)
+        shown = scene.render(frame)
         facing = self._normals @ frame.forward < 0.0
-        visible = facing & _in_sight(self._points, frame, shown)
-        thinned = np.flatnonzero(visible)[:: max(1, len(visible) // _POINTS_SHOWN)]
+        visible = np.flatnonzero(facing & _in_sight(self._points, frame, shown))
+        thinned = visible[:: max(1, len(visible) // _POINTS_SHOWN)]
         draw_points(shown.picture, frame.pixels(self._points[thinned]), _POINT)
         return shown.picture
-
-    def _paired(self, arrays: Mapping[str, NDArray[Any]], away: Array, frame: Frame) -> Picture:
-        """The body, and lines from it to the points that pull it: green near, red far."""
-        shown = render(arrays["vertices"], self._faces, frame)
-        picture = shown.picture
-        visible = np.flatnonzero(_in_sight(arrays["on_body"], frame, shown))
-        some = visible[:: max(1, len(visible) // _PAIRS_SHOWN)]
-        starts, ends = (frame.pixels(arrays[key][some]) for key in ("on_body", "on_cloud"))
-        share = np.clip(away[some, None] / _FAR_PAIR_M, 0.0, 1.0)
-        colors = (1.0 - share) * _PAIR_NEAR + share * _PAIR_FAR
-        for start, end, (blue, green, red) in zip(starts, ends, colors.astype(int), strict=True):
-            color: Color = (int(blue), int(green), int(red))
-            draw_line(picture, np.stack([start, end]), color, thickness=1)
-        draw_points(picture, ends, colors.astype(np.uint8))
-        return picture
 
     def _error_colors(self, residual_m: Array) -> Array:
         """(K, 3): how far the points lie outside (red) or inside (blue) of each triangle."""
@@ -147,6 +137,22 @@ class DebugPictures:
         colors = (1.0 - share) * _MET + share * side
         colors[count == 0] = _UNSEEN
         return np.asarray(colors)
+
+
+def _paired(scene: Scene, on_body: Array, on_cloud: Array, frame: Frame) -> Picture:
+    """The body, and lines from it to the points that pull it: green near, red far."""
+    shown = scene.render(frame)
+    visible = np.flatnonzero(_in_sight(on_body, frame, shown))
+    some = visible[:: max(1, len(visible) // _PAIRS_SHOWN)]
+    starts, ends = frame.pixels(on_body[some]), frame.pixels(on_cloud[some])
+    away = np.linalg.norm(on_cloud[some] - on_body[some], axis=1, keepdims=True)
+    share = np.clip(away / _FAR_PAIR_M, 0.0, 1.0)
+    colors = (1.0 - share) * _PAIR_NEAR + share * _PAIR_FAR
+    for start, end, (blue, green, red) in zip(starts, ends, colors.astype(int), strict=True):
+        color: Color = (int(blue), int(green), int(red))
+        draw_line(shown.picture, np.stack([start, end]), color, thickness=1)
+    draw_points(shown.picture, ends, colors.astype(np.uint8))
+    return shown.picture
 
 
 def _in_sight(points: Array, frame: Frame, shown: Rendering) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
+from workers.export.meshes import obj_mesh
 from workers.export.result import write_result
 from workers.measure.body import measure_body, measure_standing
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
@@ -42,7 +43,9 @@ def warm_up() -> BodyModel:
     sampling_of(model)
     untangled(model, model.mean, model.mean)
     joint_positions(model, model.mean, model.neutral_state().rotations)
+    obj_mesh(model.mean, model)
     compile_average()
+    measure_body(model, model.mean)
     return model
 
 

@@ -30,7 +30,7 @@ _AWAY_M = 4.0
 _EDGE_M = 0.025
 """A step in depth that shows as an edge, which is smoothed."""
 _SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-_BLOCK = 12
+_BLOCK = 6
 _FONT = "sans"
 
 
@@ -87,30 +87,49 @@ class Rendering:
     depth_m: NDArray[np.float32]
 
 
-def render(
-    vertices: Array, faces: NDArray[np.int32], frame: Frame, colors: Array | None = None
-) -> Rendering:
-    """A mesh as a frame shows it, with smooth edges.
+class Scene:
+    """A mesh, ready to be looked at from several sides."""
 
-    Args:
-        vertices: (P, 3), z up.
-        colors: (K, 3) of the triangles, blue, green and red up to 255; skin by default.
-    """
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
-    normals = vertex_normals(vertices, faces)
+    def __init__(self, vertices: Array, faces: NDArray[np.int32]) -> None:
+        """Vertices (P, 3), z up, and faces (K, 3), counter-clockwise seen from outside."""
+        self._vertices, self._faces = vertices, faces
+        self._normals = vertex_normals(vertices, faces)
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+        )
 
-    def seen(pixels: Array) -> tuple[Array, NDArray[np.float32]]:
-        found = scene.cast_rays(o3d.core.Tensor(frame.rays(pixels)))
+    def render(self, frame: Frame, colors: Array | None = None) -> Rendering:
+        """The mesh as a frame shows it, with smooth edges.
+
+        Args:
+            colors: (K, 3) of the triangles, blue, green and red up to 255; skin by default.
+        """
+        shape = (frame.height, frame.width)
+        color = np.full((frame.height * frame.width, 3), float(BACKGROUND))
+        depth = np.full(frame.height * frame.width, np.inf, np.float32)
+        near = np.flatnonzero(_near(frame.pixels(self._vertices), self._faces, shape))
+        color[near], depth[near] = self._seen(frame, _centers(near, frame.width), colors)
+        edges = _edges(depth.reshape(shape))
+        if len(edges):
+            centers = _centers(edges, frame.width)
+            around = np.concatenate([centers + np.array(aside) for aside in _SUBPIXELS])
+            mixed, _ = self._seen(frame, around, colors)
+            color[edges] = mixed.reshape(len(_SUBPIXELS), -1, 3).mean(axis=0)
+        picture = np.clip(color + 0.5, 0, 255).astype(np.uint8)
+        return Rendering(picture.reshape(*shape, 3), depth.reshape(shape))
+
+    def _seen(
+        self, frame: Frame, pixels: Array, colors: Array | None
+    ) -> tuple[Array, NDArray[np.float32]]:
+        """What is seen at picture points (n, 2): colours (n, 3) and depths (n,)."""
+        found = self._scene.cast_rays(o3d.core.Tensor(frame.rays(pixels)))
         depth = found["t_hit"].numpy()
         hit = np.flatnonzero(np.isfinite(depth))
         triangle = found["primitive_ids"].numpy().ravel()[hit]
-        corners = faces[triangle]
         uv = found["primitive_uvs"].numpy()[hit].astype(np.float64)
         share = np.stack([1.0 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
-        normal = np.einsum("nk,nki->ni", share, normals[corners])
+        normal = np.einsum("nk,nki->ni", share, self._normals[self._faces[triangle]])
         normal /= np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None] + 1e-12
         headlight = np.abs(normal @ frame.forward)
         shade = 0.34 + 0.46 * headlight + 0.20 * np.clip(normal @ _LIGHT, 0.0, 1.0)
@@ -119,19 +138,6 @@ def render(
         color[hit] = shade[:, None] * own
         return color, depth
 
-    shape = (frame.height, frame.width)
-    color = np.full((frame.height * frame.width, 3), float(BACKGROUND))
-    depth = np.full(frame.height * frame.width, np.inf, np.float32)
-    near = np.flatnonzero(_near(frame.pixels(vertices), faces, shape))
-    color[near], depth[near] = seen(_centers(near, frame.width))
-    edges = _edges(depth.reshape(shape))
-    if len(edges):
-        centers = _centers(edges, frame.width)
-        around = np.concatenate([centers + np.array(aside) for aside in _SUBPIXELS])
-        color[edges] = seen(around)[0].reshape(len(_SUBPIXELS), -1, 3).mean(axis=0)
-    picture = np.clip(color + 0.5, 0, 255).astype(np.uint8)
-    return Rendering(picture.reshape(*shape, 3), depth.reshape(shape))
-
 
 def _centers(flat: NDArray[np.intp], width: int) -> Array:
     return np.stack([flat % width, flat // width], axis=1).astype(np.float64)
@@ -139,13 +145,16 @@ def _centers(flat: NDArray[np.intp], width: int) -> Array:
 
 def _near(pixels: Array, faces: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Pixels (h, w) that a triangle can cover, and some more: no ray is cast at the others."""
-    first, second, third = (pixels[faces[:, i]] for i in range(3))
-    longest = float(max(np.abs(first - second).max(), np.abs(first - third).max()))
+    corners = [pixels[faces[:, i]] for i in range(3)]
+    sides = [(corners[i], corners[i - 1]) for i in range(3)]
+    # A triangle's vertices and its sides' middles: no point of it lies farther from all of them.
+    farthest = 0.5 * float(max(np.abs(start - end).max() for start, end in sides))
+    marks = np.concatenate([pixels, *(0.5 * (start + end) for start, end in sides)])
     height, width = -(-shape[0] // _BLOCK), -(-shape[1] // _BLOCK)
     blocks = np.zeros((height, width), np.uint8)
-    u, v = np.floor_divide(pixels, _BLOCK).astype(int).T
+    u, v = np.floor_divide(marks, _BLOCK).astype(int).T
     blocks[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = 1
-    reach = 2 * int(np.ceil(longest / _BLOCK)) + 1
+    reach = 2 * int(np.ceil(farthest / _BLOCK)) + 1
     blocks = cv2.dilate(blocks, np.ones((reach, reach), np.uint8)).astype(np.uint8)
     return np.kron(blocks, np.ones((_BLOCK, _BLOCK), bool))[: shape[0], : shape[1]] > 0
 
@@ -172,7 +181,7 @@ def render_mesh(
     """The picture alone, (height, width, 3)."""
     x, y, z = (float(value) for value in center)
     frame = Frame(view, width, height, meters_per_pixel, (x, y, z))
-    return render(vertices, faces, frame, colors).picture
+    return Scene(vertices, faces).render(frame, colors).picture
 
 
 def draw_line(

@@ -53,6 +53,8 @@ PAPERS_FIVE_MM = {
 """What Zhou et al. 2013 report on, and the limit of the mean absolute error here."""
 REPEAT_LIMIT_MM = {"large girth": 5.0, "height": 3.0, "length": 3.0, "distance": 3.0}
 _SEED = {"validation": 21, "test": 31}
+_POOL = 96
+"""Bodies of a split that are drawn, however many of them are used."""
 _REPEAT_TURN_DEG = 1.5
 
 
@@ -78,11 +80,11 @@ class Studio:
             self._standing[0, self._database.bones.index(PARTS[part][1][0])] = turn
 
     def population(self, split: Split, count: int) -> Iterator[Scan]:
-        """Bodies of a split, each in a pose of its own."""
-        shapes = self._database.sample(split, count, _SEED[split])
-        poses = self._database.sample_poses(split, count, _SEED[split])
-        for index in range(count):
-            name = f"{split}-{_SEED[split]}-{count}-{index:03d}"
+        """The first so many bodies of a split, each in a pose of its own."""
+        shapes = self._database.sample(split, _POOL, _SEED[split])
+        poses = self._database.sample_poses(split, _POOL, _SEED[split])
+        for index in range(min(count, _POOL)):
+            name = f"{split}-{index:03d}"
             yield self._scan(name, shapes.take(np.array([index])), poses[index], index)
 
     def anew(self, times: int) -> Iterator[Scan]:
@@ -310,9 +312,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bodies", type=int, default=40, help="of the test split")
+    parser.add_argument("--bodies", type=int, default=40, help="of the test split, at most 76")
     parser.add_argument("--anew", type=int, default=10, help="scans of one body standing anew")
-    parser.add_argument("--calibrate", type=int, metavar="BODIES", help="learn the intervals anew")
+    parser.add_argument(
+        "--calibrate",
+        type=int,
+        metavar="BODIES",
+        help="learn the intervals anew on so many bodies of the validation split, at most 96",
+    )
     parser.add_argument("--scans", type=Path, help="keep what is rendered here, and use it again")
     arguments = parser.parse_args()
     model = warm_up()

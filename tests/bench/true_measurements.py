@@ -58,7 +58,7 @@ class TrueBody:
         if isinstance(way, Top):
             return float(self._v[self._part == way.part, 2].max())
         if isinstance(way, Drop):
-            return float(self._at[way.upper][2] - self._at[way.lower][2])
+            return max(0.0, float(self._at[way.upper][2] - self._at[way.lower][2]))
         if isinstance(way, Route):
             return self._route(way)
         return self._section(row, way)
@@ -98,7 +98,7 @@ class TrueBody:
             through = at[plane.at] if plane.at else at[plane.start] + plane.share * line
             return through, line / np.sqrt(line @ line)
         normal = np.cross(at[plane.back] - at[plane.front], at[plane.other_side] - at[plane.side])
-        return 0.5 * (at[plane.front] + at[plane.back]), normal / np.sqrt(normal @ normal)
+        return at[plane.front], normal / np.sqrt(normal @ normal)
 
     def _segments(self, point: Array, normal: Array, parts: tuple[str, ...]) -> Array:
         """Where a plane cuts the triangles of some parts: (n, 2, 3)."""

@@ -207,6 +207,7 @@ def test_all_meshes_are_one_closed_body(result: Path) -> None:
     assert ply.volume > 0.03
     assert np.array_equal(ply.faces, faces)
     obj = trimesh.load_mesh(result / "mesh.obj", process=False, maintain_order=True)
+    assert obj.is_watertight
     assert np.array_equal(obj.faces, faces)
     assert np.abs(obj.vertices - ply.vertices).max() < 1e-6
     for name in ("mesh.glb", "avatar.glb"):

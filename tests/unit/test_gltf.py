@@ -46,7 +46,7 @@ def body(model: BodyModel, state: BodyState) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def rows(model: BodyModel, body: np.ndarray) -> list[Measurement]:
-    return measure_body(model, body, np.full(len(body), 1e-3))
+    return list(measure_body(model, body, np.full(len(body), 1e-3)).rows)
 
 
 @pytest.fixture(scope="module")
@@ -133,10 +133,14 @@ def test_another_reader_finds_every_line_by_its_name(
     geometry = trimesh.load_scene(mesh_file).geometry
     assert set(geometry) == {"body", *(row.name for row in rows)}
     for row in rows:
-        assert geometry[row.name].length == pytest.approx(row.value_m, abs=1e-5)
+        around = np.concatenate([row.path, row.path[:1]]) if row.closed else row.path
+        length = np.linalg.norm(np.diff(around, axis=0), axis=1).sum()
+        assert geometry[row.name].length == pytest.approx(length, abs=1e-5)
         points = geometry[row.name].vertices @ Z_UP_FROM_Y_UP.T
         assert np.abs(points[0] - row.path[0]).max() < 1e-6
     file = pygltflib.GLTF2().load_binary(str(mesh_file))
+    notes = {node.name: node.extras for node in file.nodes}
+    assert notes["waist_girth"]["standard"].startswith("ISO 8559-1")
     shown = {scene.name: [file.nodes[root].name for root in scene.nodes] for scene in file.scenes}
     assert shown == {"body": ["body"], "measurements": ["body", *(row.name for row in rows)]}
 

@@ -96,8 +96,8 @@ def test_a_rough_surface_is_set_free(model: BodyModel, seed: int) -> None:
     assert not turned_over(free, reference, model.faces).any()
     assert (triangle_areas(free, model.faces) > 0.0).all()
     moved = np.linalg.norm(free - rough, axis=1)
-    assert np.mean(moved > 1e-6) < 0.35
-    assert np.sqrt(np.mean(moved**2)) < 0.0015
+    assert np.mean(moved > 1e-6) < 0.5
+    assert np.sqrt(np.mean(moved**2)) < 0.0025
 
 
 def test_an_arm_laid_on_the_trunk_parts_from_it(model: BodyModel) -> None:
@@ -112,6 +112,21 @@ def test_an_arm_laid_on_the_trunk_parts_from_it(model: BodyModel) -> None:
     free = untangled(model, body, body)
     assert self_intersections(free, model.faces) == 0
     assert np.linalg.norm(free - body, axis=1).max() < 0.025
+
+
+def test_what_cannot_part_is_not_spoiled(model: BodyModel) -> None:
+    """A hand deep in a thigh was flattened by 7 cm in vain; the rest is mended all the same."""
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("upper_arm_left"), 1] = np.radians(75.0)
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    reference = model.vertices(state)
+    rough = _roughened(model, reference, 1)
+    free = untangled(model, rough, reference)
+    left = crossing_pairs(free, model.faces)
+    names = np.array(model.part_names)[model.part_of_vertex[model.faces[left].ravel()]]
+    assert len(left) > 0
+    assert not np.isin(names, ("head", "foot_right", "fingers_right")).any()
+    assert np.linalg.norm(free - rough, axis=1).max() < 0.03
 
 
 def test_a_good_surface_stays_as_it_is(model: BodyModel) -> None:

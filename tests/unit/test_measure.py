@@ -232,7 +232,7 @@ def _run(*words: str) -> str:
 
 def test_meshes_are_measured_without_a_fit(model: BodyModel, tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_bytes(ply_mesh(model.mean, model.faces))
-    (tmp_path / "mesh.obj").write_bytes(obj_mesh(model.mean, model.faces))
+    (tmp_path / "mesh.obj").write_bytes(obj_mesh(model.mean, model))
     values = _values(model, model.mean)
     for name in ("mesh.ply", "mesh.obj"):
         document = json.loads(_run(str(tmp_path / name), "--json"))

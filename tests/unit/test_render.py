@@ -9,7 +9,7 @@ import pytest
 
 from workers.export.preview import _spread, preview
 from workers.measure.body import Measurement, measure_body
-from workers.render import BACKGROUND, Frame, render
+from workers.render import BACKGROUND, Frame, Scene
 from workers.scape.model import BodyModel, load_model
 from workers.scape.verdict import Verdict
 
@@ -23,7 +23,7 @@ def model() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def rows(model: BodyModel) -> list[Measurement]:
-    return measure_body(model, model.mean, np.full(model.vertex_count, 1e-3))
+    return list(measure_body(model, model.mean, np.full(model.vertex_count, 1e-3)).rows)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_a_ball_off_the_centre_is_where_it_should_be(
     """A camera helper's natural "up" once turned every picture by 180 degrees."""
     sphere = o3d.geometry.TriangleMesh.create_sphere(0.05).translate(ball)
     frame = Frame(view, 100, 100, 0.01, (0.0, 0.0, 1.0))
-    shown = render(np.asarray(sphere.vertices), np.asarray(sphere.triangles), frame)
+    shown = Scene(np.asarray(sphere.vertices), np.asarray(sphere.triangles)).render(frame)
     v, u = np.nonzero(np.isfinite(shown.depth_m))
     assert np.allclose((u.mean(), v.mean()), where, atol=0.6)
     assert np.allclose(frame.pixels(np.array([ball])), where)
@@ -54,7 +54,8 @@ def test_triangles_take_their_colours() -> None:
     square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 0, 2], [-1, 0, 2]])
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     colors = np.array([[0.0, 0.0, 255.0], [255.0, 0.0, 0.0]])
-    picture = render(square, faces, Frame("front", 50, 50, 0.03, (0.0, 0.0, 1.0)), colors).picture
+    frame = Frame("front", 50, 50, 0.03, (0.0, 0.0, 1.0))
+    picture = Scene(square, faces).render(frame, colors).picture
     assert picture[40, 40, 2] > 150 > 10 > picture[40, 40, 0]
     assert picture[10, 10, 0] > 150 > 10 > picture[10, 10, 2]
 

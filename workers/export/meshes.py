@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import io
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.scape.deformation import Faces, vertex_normals
+from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
 
@@ -34,13 +35,24 @@ def ply_cloud(points: Array, normals: Array) -> bytes:
     return header.encode() + np.concatenate([points, normals], axis=1).astype("<f4").tobytes()
 
 
-def obj_mesh(vertices: Array, faces: Faces) -> bytes:
-    """Wavefront OBJ with normals, world frame, metres."""
-    out = io.StringIO()
-    out.write("# metres, z up\n")
-    normals = vertex_normals(vertices, faces)
-    out.write(("v %.6f %.6f %.6f\n" * len(vertices)) % tuple(vertices.ravel()))
-    out.write(("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()))
-    corners = np.repeat(faces.ravel() + 1, 2)
-    out.write(("f %d//%d %d//%d %d//%d\n" * len(faces)) % tuple(corners))
-    return out.getvalue().encode()
+def obj_mesh(vertices: Array, model: BodyModel) -> bytes:
+    """Wavefront OBJ with normals, world frame, metres.
+
+    Without texture coordinates: common readers split the surface along their seams, and it would be
+    neither closed nor in the template's topology any more.
+    """
+    normals = vertex_normals(vertices, model.faces)
+    lines = [
+        "# metres, z up\n",
+        ("v %.6f %.6f %.6f\n" * len(vertices)) % tuple(vertices.ravel()),
+        ("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()),
+        _obj_faces(model),
+    ]
+    return "".join(lines).encode()
+
+
+@lru_cache(maxsize=2)
+def _obj_faces(model: BodyModel) -> str:
+    """The faces' lines, which are the same for every body."""
+    corners = np.repeat(model.faces.ravel() + 1, 2)
+    return ("f %d//%d %d//%d %d//%d\n" * len(model.faces)) % tuple(corners)

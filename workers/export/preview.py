@@ -15,9 +15,9 @@ from workers.render import (
     Frame,
     Picture,
     Rendering,
+    Scene,
     draw_line,
     png,
-    render,
     text_width,
     write_text,
 )
@@ -40,7 +40,7 @@ _SHOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
 }
 """View -> rows named on its left and on its right; a row that was not measured is left out."""
-_BODY_PIXELS = 560
+_BODY_PIXELS = 520
 _BORDER = 26
 _STRIP = 34
 """Below the bodies: why to scan again."""
@@ -53,6 +53,9 @@ _LEADER: Color = (176, 172, 168)
 _WARNING: Color = (40, 60, 170)
 _FLOOR: Color = (226, 224, 222)
 _BEHIND_M = 0.012
+"""How far behind the skin a girth's line counts as hidden; it lies on the skin's far side."""
+_BENEATH_M = 0.06
+"""The same for straight distances, which run beneath the skin on the near side too."""
 _STATURE_GAP = 16
 
 
@@ -64,8 +67,9 @@ def preview(
 ) -> bytes:
     """The picture as PNG."""
     by_name = {measurement.name: measurement for measurement in measurements}
+    scene = Scene(vertices, faces)
     panels = [
-        _panel(vertices, faces, view, _rows(by_name, left), _rows(by_name, right))
+        _panel(scene, vertices, view, _rows(by_name, left), _rows(by_name, right))
         for view, (left, right) in _SHOWN.items()
     ]
     picture = np.concatenate(panels, axis=1)
@@ -86,8 +90,8 @@ def _label(row: Measurement) -> str:
 
 
 def _panel(
+    scene: Scene,
     vertices: Array,
-    faces: NDArray[np.int32],
     view: str,
     left: list[Measurement],
     right: list[Measurement],
@@ -99,7 +103,7 @@ def _panel(
     x, y, z = (float(value) for value in 0.5 * (low + high))
     room = 2 * (_STATURE_GAP + 4)
     frame = Frame(view, int(across / scale) + room, _BODY_PIXELS + 2 * _BORDER, scale, (x, y, z))
-    rendering = render(vertices, faces, frame)
+    rendering = scene.render(frame)
     columns = [max((text_width(_label(row), size=_SIZE) for row in rows), default=0) + 2 * _GAP
                for rows in (left, right)]  # fmt: skip
     picture = np.full((frame.height, sum(columns) + frame.width, 3), BACKGROUND, np.uint8)
@@ -128,7 +132,8 @@ def _drawn(
     line = frame.pixels(path)
     u, v = np.rint(line).astype(int).T
     u, v = np.clip(u, 0, frame.width - 1), np.clip(v, 0, frame.height - 1)
-    hidden = frame.depths(path) > rendering.depth_m[v, u] + _BEHIND_M
+    behind = _BEHIND_M if row.closed else _BENEATH_M
+    hidden = frame.depths(path) > rendering.depth_m[v, u] + behind
     line = line + np.array([shift, 0.0])
     for start, end in _runs(hidden):
         piece = line[start : min(end + 1, len(line))]

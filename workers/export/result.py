@@ -46,7 +46,7 @@ def write_result(
         faces = model.faces
         files = {
             "mesh.ply": ply_mesh(fit.vertices, faces),
-            "mesh.obj": obj_mesh(fit.vertices, faces),
+            "mesh.obj": obj_mesh(fit.vertices, model),
             "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
             "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
             "cloud.ply": ply_cloud(cloud.points, cloud.normals),

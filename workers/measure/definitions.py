@@ -89,7 +89,7 @@ class Top:
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """How much lower one landmark is than another."""
+    """How much lower one landmark is than another; 0 if it is not."""
 
     upper: str
     lower: str

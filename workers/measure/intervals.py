@@ -48,10 +48,13 @@ class ErrorModel:
     gain: float
 
     def interval(self, value: float, sigma: float) -> tuple[float, float]:
-        """The 95 % interval of a value whose line has this posterior deviation; it always holds
-        the value itself."""
+        """The 95 % interval of a value whose line has this posterior deviation.
+
+        It always holds the value itself, and no length below 0.
+        """
         half = float(np.hypot(self.constant, self.gain * sigma))
-        return min(value, value - self.bias - half), max(value, value - self.bias + half)
+        middle = value - self.bias
+        return max(0.0, min(value, middle - half)), max(value, middle + half)
 
 
 def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:

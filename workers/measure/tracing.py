@@ -106,7 +106,7 @@ class _Tracer:
                 top = int(index[np.argmax(self._vertices[index, 2])])
                 return float(self._vertices[top, 2]), EdgePoints.at([top]), False, True
             case Drop(upper, lower):
-                drop = float(self._at(upper)[2] - self._at(lower)[2])
+                drop = max(0.0, float(self._at(upper)[2] - self._at(lower)[2]))
                 ends = EdgePoints.at([self._model.landmarks[upper], self._model.landmarks[lower]])
                 return drop, ends, False, False
 
@@ -117,7 +117,7 @@ class _Tracer:
         return np.mean([self._at(landmark) for landmark in landmarks], axis=0)
 
     def _plane(self, plane: Level | Square | Tilted) -> tuple[Array, Array]:
-        """A point of a plane, near the middle of what it is to cut, and its normal."""
+        """A point of a plane, near what it is to cut, and its normal."""
         match plane:
             case Level(landmarks, towards, share):
                 point = self._mean(landmarks)
@@ -132,7 +132,7 @@ class _Tracer:
                 normal = np.cross(
                     self._at(other) - self._at(side), self._at(back) - self._at(front)
                 )
-                return self._mean((front, back)), normal / np.linalg.norm(normal)
+                return self._at(front), normal / np.linalg.norm(normal)
 
     def _cut(self, section: Section) -> tuple[EdgePoints, Array]:
         """The tape's points of a section and where they are; breadths share it with their girth."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from station.depth import PointCloud, Preprocessed
+from station.depth import CameraView, PointCloud, Preprocessed
 from station.errors import InputError
-from workers.scape.correspondence import OrientedTree
+from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
@@ -32,7 +32,7 @@ from workers.scape.joint import (
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
-from workers.scape.surface import SurfaceFit, fit_surface
+from workers.scape.surface import fit_surface
 from workers.scape.verdict import (
     PartReport,
     Verdict,
@@ -51,7 +51,6 @@ _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
 _EXPLAINED = 0.008
-_CAMERA_POINTS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +70,8 @@ class FitResult:
     correspondences: int
     iterations: int
     camera_shifts_m: dict[str, float]
-    """How far each camera's points lie off the surface that all agree on."""
+    """How far each camera's points had to move to agree with all others."""
+    cameras: CameraCorrections
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -119,20 +119,23 @@ def _fit(
             model, target, starts[0], lambda share: progress("icp", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
+        cameras = CameraCorrections.build(cloud, scan.views)
         fitted = finished = time.monotonic()
     else:
-        joint = _best_start(model, sampling, cloud, target, starts, progress, observer)
+        joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
+        cameras = joint.cameras
         observer("joint", {"vertices": joint.vertices})
         fitted = time.monotonic()
         progress("surface", 0.0)
+        cloud = replace(cloud, points=cameras.moved(cloud.points, cloud.camera))
         surface = fit_surface(model, joint.vertices, cloud)
         free = untangled(model, surface.vertices, joint.vertices)
         surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
-    shifts = _camera_shifts(model, surface, cloud)
+    shifts = cameras.shifts_m(cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
     # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
@@ -152,6 +155,7 @@ def _fit(
         correspondences=used,
         iterations=iterations,
         camera_shifts_m=shifts,
+        cameras=cameras,
         seconds={
             "align": aligned - start,
             "icp": fitted - aligned,
@@ -165,6 +169,7 @@ def _best_start(
     model: BodyModel,
     sampling: Sampling,
     cloud: PointCloud,
+    views: Sequence[CameraView],
     target: Target,
     starts: Sequence[BodyState],
     progress: Progress,
@@ -172,8 +177,9 @@ def _best_start(
 ) -> JointResult:
     """Fit from the best start; from others too while a limb's worth of points stays unexplained."""
     best, least = None, np.inf
+    cameras = CameraCorrections.build(cloud, views)
     for start in starts[:_MOST_STARTS]:
-        coarse = fit_jointly(model, sampling, target, start, COARSE, observer=observer)
+        coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
         left = unexplained_share(model, coarse.vertices, cloud)
         if left < least:
             best, least = coarse, left
@@ -184,7 +190,14 @@ def _best_start(
         normals = vertex_normals(best.vertices, model.faces)
         state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
         best = fit_jointly(
-            model, sampling, target, state, schedule, lambda share: progress("icp", share), observer
+            model,
+            sampling,
+            target,
+            state,
+            best.cameras,
+            schedule,
+            lambda share: progress("icp", share),
+            observer,
         )
     return best
 
@@ -199,23 +212,3 @@ def _refuse_absurd(cloud: PointCloud) -> None:
         raise InputError(
             f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected"
         )
-
-
-def _camera_shifts(model: BodyModel, surface: SurfaceFit, cloud: PointCloud) -> dict[str, float]:
-    """The rigid shift (m) that would bring each camera's points onto the common surface."""
-    normals = vertex_normals(surface.vertices, model.faces)
-    tree = OrientedTree.build(surface.vertices, normals)
-    shifts = {}
-    for index, name in enumerate(cloud.camera_names):
-        mine = np.flatnonzero(cloud.camera == index)
-        mine = mine[even_subset(len(mine), 10 * _CAMERA_POINTS)]
-        if len(mine) < _CAMERA_POINTS:
-            continue
-        vertex = tree.nearest(cloud.points[mine], cloud.normals[mine])
-        direction = normals[vertex]
-        away = np.einsum("ni,ni->n", direction, cloud.points[mine] - surface.vertices[vertex])
-        near = np.abs(away) < 0.03
-        direction, away = direction[near], away[near]
-        normal = direction.T @ direction + 1e-3 * len(away) * np.eye(3)
-        shifts[name] = float(np.linalg.norm(np.linalg.solve(normal, direction.T @ away)))
-    return shifts

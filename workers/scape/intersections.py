@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from workers.scape.crossings import crossing_pairs
 from workers.scape.deformation import Faces, vertex_normals
@@ -21,12 +22,12 @@ from workers.scape.model import BodyModel
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MOST_ROUNDS = 40
+_MOST_ROUNDS = 30
 _STUBBORN_ROUNDS = 3
 """Rounds after which a place no longer counts on the model's own shape."""
 _ROUNDS_A_RING = 4
 _SWEEPS = 8
-_FLATTENING = 0.75
+_FLATTENING = 0.5
 """Share of the way to the neighbours' mean that a stubborn vertex goes in one round."""
 
 
@@ -49,7 +50,8 @@ def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
 def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     """The surface (P, 3) without crossings and turned triangles.
 
-    Parts that are pushed centimetres into each other, as no body can be, may keep some crossings.
+    Parts that are pushed centimetres into each other, as no body can be, stay so: to flatten them
+    until they part would spoil them.
 
     Args:
         vertices: (P, 3), fitted.
@@ -57,18 +59,16 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     """
     faces = model.faces
     mean = _neighbour_mean(model)
-    current = best = vertices
-    fewest = len(faces)
+    current = gentle = vertices
     trouble = np.zeros(len(vertices), np.int64)
     asking: Mask = np.ones(len(faces), bool)
     for round_ in range(_MOST_ROUNDS):
         bad = turned_over(current, reference, faces)
         bad[crossing_pairs(current, faces, asking).ravel()] = True
-        count = int(bad.sum())
-        if count < fewest:
-            best, fewest = current, count
-        if count == 0:
-            break
+        if not bad.any():
+            return current
+        if round_ == _STUBBORN_ROUNDS:
+            gentle = current
         corners = np.zeros(len(vertices), bool)
         corners[faces[bad]] = True
         marked = _grown(corners, mean, 1)
@@ -78,7 +78,21 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
         moved = np.zeros(len(vertices), bool)
         moved[patch] = True
         asking = np.asarray(moved[faces].any(axis=1))
-    return best
+    hopeless = turned_over(current, reference, faces)
+    hopeless[crossing_pairs(current, faces, asking).ravel()] = True
+    return _restored(current, gentle, np.unique(faces[hopeless]), mean)
+
+
+def _restored(
+    vertices: Array, before: Array, corners: NDArray[np.int32], mean: sp.csr_matrix
+) -> Array:
+    """The surface with those moved places as before that hold one of the corners."""
+    moved = np.flatnonzero((vertices != before).any(axis=1))
+    _, place = connected_components(mean[moved][:, moved], directed=False)
+    back = moved[np.isin(place, place[np.isin(moved, corners)])]
+    restored = vertices.copy()
+    restored[back] = before[back]
+    return restored
 
 
 def _relaxed(

@@ -17,13 +17,14 @@ from scipy.spatial import cKDTree
 
 from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
+from workers.scape.cameras import CameraCorrections
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.free_space import FreeSpace
 from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
-from workers.scape.rows import Rows, floor_rows, outline_rows
+from workers.scape.rows import CameraTerms, Rows, floor_rows, outline_rows
 from workers.scape.sampled import SampledBody, twist_chain
 
 Array = NDArray[np.float64]
@@ -113,6 +114,8 @@ class Target:
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
     free_space: FreeSpace
+    camera: NDArray[np.integer]
+    """(n,): whose point it is."""
 
     @classmethod
     def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
@@ -124,6 +127,7 @@ class Target:
             cloud.sigma_m[used],
             even_subset(len(used), _PULLED_POINTS),
             FreeSpace.build(views),
+            cloud.camera[used].astype(np.intp),
         )
 
 
@@ -137,9 +141,11 @@ def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
 @dataclass(frozen=True, slots=True)
 class JointResult:
     state: BodyState
+    cameras: CameraCorrections
     vertices: Array
     covariance: Array
-    """(D, D) of (rotations, beta, translation), see SampledBody.jacobian."""
+    """(D + 6 C, D + 6 C) of (rotations, beta, translation), see SampledBody.jacobian, and of the
+    cameras' corrections."""
     correspondences: int
     iterations: int
 
@@ -149,6 +155,7 @@ def fit_jointly(
     sampling: Sampling,
     target: Target,
     state: BodyState,
+    cameras: CameraCorrections,
     schedule: tuple[Stage, ...],
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
     observer: Observer = unobserved,
@@ -156,29 +163,44 @@ def fit_jointly(
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
     information = np.eye(1)
-    used = 0
+    terms: _DataTerms | None = None
     for step, stage in enumerate(schedule):
         body, sample_of_vertex = sampling.stage(stage.samples)
         vertices = model.vertices(state)
-        weight, pull, used = _data_terms(
-            model, target, vertices, stage, sample_of_vertex, len(body.indices), observer
+        terms = _data_terms(
+            model, target, cameras, vertices, stage, sample_of_vertex, len(body.indices), observer
         )
-        state, information = _step(model, body, state, stage, weight, pull, prior)
+        state, cameras, information = _step(model, body, state, cameras, stage, terms, prior)
         progress((step + 1) / len(schedule))
     covariance = scipy.linalg.inv(information)
-    return JointResult(state, model.vertices(state), covariance, used, len(schedule))
+    assert terms is not None
+    return JointResult(
+        state, cameras, model.vertices(state), covariance, terms.correspondences, len(schedule)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _DataTerms:
+    weight: Array
+    """(n, 3, 3) at each sample."""
+    pull: Array
+    """(n, 3)."""
+    cameras: CameraTerms | None
+    """None while the corrections are kept."""
+    correspondences: int
 
 
 def _data_terms(
     model: BodyModel,
     target: Target,
+    cameras: CameraCorrections,
     vertices: Array,
     stage: Stage,
     sample_of_vertex: NDArray[np.intp],
     samples: int,
     observer: Observer,
-) -> tuple[Array, Array, int]:
-    """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3), and the number of rows."""
+) -> _DataTerms:
+    """Correspondences, floor and outlines, summed up at the samples."""
     normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
     pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
@@ -189,22 +211,25 @@ def _data_terms(
     probing, found = cloud.pairs(vertices[probes], normals[probes], **limits)
     vertex = np.concatenate([mine, probes[probing]])
     point = np.concatenate([pulled[asking], found])
-    offsets = cloud.points[point] - vertices[vertex]
-    on_body, on_cloud = vertices[vertex], cloud.points[point]
+    on_body, camera = vertices[vertex], target.camera[point]
+    on_cloud = cameras.moved(cloud.points[point], camera)
     observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
     direction = normals[vertex]
-    residual = np.einsum("ni,ni->n", direction, offsets)
+    residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    row_weight = stage.row_share * robust / variance
-    rows = [
-        Rows(vertex, direction, residual, row_weight),
-        floor_rows(vertices, normals, 0.5 * stage.gate_m),
-    ]
+    pairs = Rows(vertex, direction, residual, stage.row_share * robust / variance)
+    rows = [pairs, floor_rows(model, vertices, normals, max(0.012, 0.5 * stage.gate_m))]
+    camera_terms = None
     if stage.samples != _COARSE:
         rows.append(outline_rows(model, target.free_space, vertices, stage.row_share))
+        if len(cameras):
+            derivative = cameras.derivative(on_cloud, camera, direction)
+            camera_terms = CameraTerms.build(
+                pairs, derivative, camera, len(cameras), sample_of_vertex, samples
+            )
     weight, pull = Rows.joined(*rows).at_samples(sample_of_vertex, samples)
-    return weight, pull, len(vertex)
+    return _DataTerms(weight, pull, camera_terms, len(vertex))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,19 +256,22 @@ def _step(
     model: BodyModel,
     body: SampledBody,
     state: BodyState,
+    cameras: CameraCorrections,
     stage: Stage,
-    weight: Array,
-    pull: Array,
+    terms: _DataTerms,
     prior: _TwistPrior,
-) -> tuple[BodyState, Array]:
-    """One Gauss-Newton step; returns the new state and its normal matrix (D, D)."""
+) -> tuple[BodyState, CameraCorrections, Array]:
+    """One Gauss-Newton step; returns the new state, corrections and the normal matrix."""
     parts = model.part_count
     active = min(stage.components, model.beta_count)
-    _, rows = body.jacobian(state, active)
-    size = rows.shape[2]
-    weighted = weight.astype(np.float32) @ rows
-    normal = (rows.reshape(-1, size).T @ weighted.reshape(-1, size)).astype(np.float64)
-    gradient = (pull.ravel().astype(np.float32) @ rows.reshape(-1, size)).astype(np.float64)
+    _, derivative = body.jacobian(state, active)
+    size = derivative.shape[2]
+    rows = derivative.reshape(-1, size)
+    extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
+    normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
+    weighted = terms.weight.astype(np.float32) @ derivative
+    normal[:size, :size] = rows.T @ weighted.reshape(-1, size)
+    gradient[:size] = terms.pull.ravel().astype(np.float32) @ rows
     shape = slice(3 * parts, 3 * parts + active)
     normal[shape, shape] += np.eye(active)
     gradient[shape] -= state.beta[:active]
@@ -251,11 +279,22 @@ def _step(
     twists = model.relative_twists(state.rotations)[1:].ravel()
     normal[: 3 * parts, : 3 * parts] += change.T @ prior.information @ change
     gradient[: 3 * parts] -= change.T @ prior.information @ (twists - prior.mean)
-    normal[np.diag_indices_from(normal)] += 1e-6 * np.trace(normal) / size
-    factor = scipy.linalg.cho_factor(normal)
-    delta = scipy.linalg.cho_solve(factor, gradient)
+    body_only = np.arange(size)
+    normal[body_only, body_only] += 1e-6 * np.trace(normal) / size
+    if terms.cameras is not None:
+        bound = scipy.linalg.block_diag(*cameras.bound())
+        normal[size:, size:] = terms.cameras.normal + bound
+        gradient[size:] = terms.cameras.gradient - bound @ cameras.xi.ravel()
+        together = rows.T @ terms.cameras.cross.reshape(-1, extra).astype(np.float32)
+        normal[:size, size:] = -together
+        normal[size:, :size] = -together.T
+    delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
     turned = np.clip(delta[: 3 * parts].reshape(-1, 3), -0.5, 0.5)
     beta = state.beta.copy()
     beta[:active] += delta[shape]
-    new = BodyState(so3_exp(turned) @ state.rotations, beta, state.translation + delta[-3:])
-    return new, normal
+    new = BodyState(
+        so3_exp(turned) @ state.rotations, beta, state.translation + delta[size - 3 : size]
+    )
+    if extra:
+        cameras = cameras.stepped(delta[size:].reshape(-1, 6))
+    return new, cameras, normal

@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 
 _FLOOR_SIGMA_M = 0.004
 _FLOOR_SHARE = 0.02
-_SOLE_BAND_M = 0.012
+_SOLE_BAND_M = 0.003
+_FACING_DOWN = -0.8
 _OUTLINE_SIGMA_M = 0.004
 _SEARCHED = ("hand", "thumb", "fingers")
 """The search for the hands looks at points; one curl for four fingers cannot keep an outline."""
@@ -55,16 +56,59 @@ class Rows:
         return weight, np.stack(pull, axis=1)
 
 
-def floor_rows(vertices: Array, normals: Array, reach_m: float) -> Rows:
-    """The soles stand on z = 0, which no camera sees; nothing lies below it."""
-    down = (normals[:, 2] < -0.8) & (vertices[:, 2] < _SOLE_BAND_M)
-    near = down & (vertices[:, 2] > -max(_SOLE_BAND_M, reach_m))
-    touching = np.flatnonzero(near | (vertices[:, 2] < 0.0))
+@dataclass(frozen=True, slots=True)
+class CameraTerms:
+    """What the points' rows say of C cameras' corrections, and of them together with the body."""
+
+    normal: Array
+    """(6 C, 6 C)."""
+    gradient: Array
+    """(6 C,)."""
+    cross: Array
+    """(n, 3, 6 C): at each sample, how its pull changes with the corrections."""
+
+    @classmethod
+    def build(
+        cls, rows: Rows, derivative: Array, camera: NDArray[np.integer], cameras: int,
+        sample_of_vertex: NDArray[np.intp], count: int,
+    ) -> CameraTerms:  # fmt: skip
+        """Of rows whose points, of cameras (n,), move by derivative (n, 6)."""
+        normal = np.zeros((6 * cameras, 6 * cameras))
+        gradient = np.zeros(6 * cameras)
+        cell = sample_of_vertex[rows.vertex] * cameras + camera
+        cross = np.empty((count * cameras, 3, 6))
+        for j in range(6):
+            weighted = rows.weight * derivative[:, j]
+            for i in range(3):
+                cross[:, i, j] = np.bincount(cell, weighted * rows.direction[:, i], count * cameras)
+        for index in range(cameras):
+            mine = camera == index
+            own = slice(6 * index, 6 * index + 6)
+            weighted = derivative[mine] * rows.weight[mine, None]
+            normal[own, own] = derivative[mine].T @ weighted
+            gradient[own] = -weighted.T @ rows.residual_m[mine]
+        side_by_side = cross.reshape(count, cameras, 3, 6).transpose(0, 2, 1, 3)
+        return cls(normal, gradient, side_by_side.reshape(count, 3, 6 * cameras))
+
+
+def floor_rows(model: BodyModel, vertices: Array, normals: Array, reach_m: float) -> Rows:
+    """Each foot's lowest millimetres stand on z = 0, which no camera sees; the arch does not.
+
+    A foot that is farther from the floor than reach_m is left alone; nothing lies below the floor.
+    """
+    height = vertices[:, 2]
+    touching = height < 0.0
+    for side in ("left", "right"):
+        foot = model.part_of_vertex == model.part_names.index(f"foot_{side}")
+        low = float(height[foot].min())
+        if abs(low) < reach_m:
+            touching |= foot & (height < low + _SOLE_BAND_M) & (normals[:, 2] < _FACING_DOWN)
+    found = np.flatnonzero(touching)
     return Rows(
-        touching,
-        np.tile((0.0, 0.0, 1.0), (len(touching), 1)),
-        -vertices[touching, 2],
-        np.full(len(touching), _FLOOR_SHARE / _FLOOR_SIGMA_M**2),
+        found,
+        np.tile((0.0, 0.0, 1.0), (len(found), 1)),
+        -height[found],
+        _FLOOR_SHARE / _FLOOR_SIGMA_M**2 * model.vertex_shares[found],
     )
 
 

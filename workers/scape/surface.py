@@ -103,11 +103,18 @@ def _gathered(
     gate_m: float,
     angle_rad: float,
 ) -> tuple[Array, Array]:
-    """Each vertex' mean distance (P,) to its points along the normal, and its information."""
+    """Each vertex' mean distance (P,) to its points along their normals, and its information.
+
+    The skin is curved and the template coarse: the points around a vertex lie below its tangent
+    plane by half the square of their distance over the radius, and the vertex lies below theirs by
+    as much. Taken along the vertex' normal, the mean would draw a limb's vertices inwards, where
+    the polygon through them is short already; along the points' own normals it puts them as far
+    outside as the polygon's girth needs to be that of the curve, to second order.
+    """
     used, vertex = OrientedTree.build(vertices, normals).pairs(
         points, directions, max_distance_m=gate_m, max_angle_rad=angle_rad
     )
-    distance = np.einsum("ni,ni->n", normals[vertex], points[used] - vertices[vertex])
+    distance = np.einsum("ni,ni->n", directions[used], points[used] - vertices[vertex])
     information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
     weight: Array = np.bincount(vertex, information, count).astype(np.float64)
