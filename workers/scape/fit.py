@@ -71,7 +71,6 @@ class FitResult:
     iterations: int
     camera_shifts_m: dict[str, float]
     """How far each camera's points had to move to agree with all others."""
-    cameras: CameraCorrections
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -155,7 +154,6 @@ def _fit(
         correspondences=used,
         iterations=iterations,
         camera_shifts_m=shifts,
-        cameras=cameras,
         seconds={
             "align": aligned - start,
             "icp": fitted - aligned,
