@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-fit bench-measure
+BENCHES := bench-capture bench-fit bench-calibration bench-drift
 
 .PHONY: help demo test check format train evaluate-model intervals clean $(BENCHES)
 
@@ -43,7 +43,7 @@ intervals: $(VENV)/train.stamp
 # The benchmarks of fit and measurements render bodies that the model never saw, which takes
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
-bench-capture: $(VENV)/dev.stamp
+bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

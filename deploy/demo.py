@@ -1,20 +1,28 @@
-"""`make demo`: a booth of four replayed Kinects, one scan, the result's path printed."""
+"""`make demo`: a booth of four replayed Kinects is calibrated, then scans; the result's path is
+printed."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
+from station.calibration.rig import Rig
 from station.drivers.freenect import find_library
+from station.drivers.virtual_cli import PROCEDURE, TRUTH
 from station.errors import DriverError
+from station.geometry import invert, so3_log
 
 BODY = Path(__file__).parents[1] / "station/data/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
+WAVING_S = 20
 
 
 def main() -> int:
@@ -31,10 +39,19 @@ def main() -> int:
         print(f"note: {error}; reading the same recordings with the recorded driver")
         driver = "recorded"
     if not config.exists() or f'"{driver}"' not in config.read_text():
-        print("rendering four Kinect recordings of a virtual person ...", flush=True)
+        print("rendering what four Kinects see of a calibration and a person ...", flush=True)
         options = ("--body", arguments.body, "--out", booth, "--driver", driver)
-        subprocess.run([*STATION, "record-virtual", *options], check=True)
+        calibration = ("--calibration", str(WAVING_S))
+        record = [*STATION, "record-virtual", *options, *calibration]
+        subprocess.run(record, check=True, stdout=subprocess.DEVNULL)
     environment = {**os.environ, "BOOTH_CONFIG": str(config)}
+    if not (booth / "calibration.json").exists():
+        calibrate = [*STATION, "calibrate", "--recordings", str(booth / PROCEDURE)]
+        if subprocess.run(calibrate, env=environment, check=False).returncode:
+            return 1
+        # What was seen is kept beside the calibration; the recordings take a gigabyte.
+        shutil.rmtree(booth / PROCEDURE)
+    compare(Rig.load(booth / "calibration.json"), Rig.load(booth / TRUTH))
     log = (booth / "station.log").open("w")
     print(f"starting the station (log: {log.name}) ...", flush=True)
     station = subprocess.Popen(
@@ -49,6 +66,24 @@ def main() -> int:
         station.send_signal(signal.SIGTERM)
         station.wait(timeout=15)
     return done.returncode
+
+
+def compare(found: Rig, truth: Rig) -> None:
+    """Print how well the calibration found the cameras, relative to one another."""
+    reference = truth.reference
+    shifts_m, turns_rad = [], []
+    for name in truth.cameras:
+        (ours, true) = (
+            invert(rig.cameras[reference].world_from_camera) @ rig.cameras[name].world_from_camera
+            for rig in (found, truth)
+        )
+        off = invert(true) @ ours
+        shifts_m.append(np.linalg.norm(off[:3, 3]))
+        turns_rad.append(np.linalg.norm(so3_log(off[:3, :3])))
+    print(
+        f"the cameras were found within {1e3 * max(shifts_m):.1f} mm and "
+        f"{np.degrees(max(turns_rad)):.2f} degrees of where they are, relative to {reference}"
+    )
 
 
 def _wait_for_control(environment: dict[str, str]) -> None:

@@ -15,7 +15,7 @@ from station.config import BoothConfig, find_config, load_config
 from station.drivers.base import DepthDriver, DepthFrame, DeviceInfo
 from station.drivers.registry import make_driver
 from station.errors import DriverError
-from station.messages import CameraHealth, DesiredState, FrameHeader
+from station.messages import CameraHealth, DesiredState, FrameHeader, SensorInfo
 from station.service import notify, set_up_logs, stop_event
 from station.topics import TOPICS
 from station.transport import publisher, subscriber
@@ -35,6 +35,7 @@ class CaptureProcess:
         self._out = publisher(self._context, folder, f"camera-{name}", "depth")
         self._wishes = subscriber(self._context, folder, ["desired"], ["desired"])
         self._topic, self._health_topic = f"depth/{name}".encode(), f"health/{name}".encode()
+        self._sensor_topic = f"sensor/{name}".encode()
         self._streaming = False
         self._driver: DepthDriver | None = None
         self._info: DeviceInfo | None = None
@@ -83,6 +84,7 @@ class CaptureProcess:
         self._driver = driver
         self._clock = DeviceClock(self._info.tick_hz, self._info.tick_bits)
         self._last_sequence = None
+        self._tell_health(now=True)
         self._log.info("streaming from %s", self._info.serial)
 
     def _read(self) -> None:
@@ -144,7 +146,23 @@ class CaptureProcess:
             self._name, self._state, self._detail, self._frames, self._lost, resets
         )
         self._out.send_multipart([self._health_topic, health.pack()])
+        if self._info is not None:
+            self._out.send_multipart([self._sensor_topic, self._sensor(self._info).pack()])
         notify("WATCHDOG=1")
+
+    def _sensor(self, info: DeviceInfo) -> SensorInfo:
+        return SensorInfo(
+            camera=self._name,
+            serial=info.serial,
+            model=info.model,
+            width=info.width,
+            height=info.height,
+            K=info.K.tolist(),
+            distortion=info.distortion.tolist(),
+            depth_scale_m=info.depth_scale_m,
+            tick_hz=info.tick_hz,
+            tick_bits=info.tick_bits,
+        )
 
 
 @click.command()

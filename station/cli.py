@@ -13,6 +13,8 @@ COMMANDS = {
     "scan": ("station.operator_cli:scan", "scan the person in the booth"),
     "status": ("station.operator_cli:status", "show cameras, scans and workers"),
     "stop": ("station.operator_cli:stop", "stop the sensors"),
+    "calibrate": ("station.calibration.calibrate_cli:calibrate", "find where the cameras are"),
+    "check": ("station.calibration.check_cli:check", "has a camera moved since?"),
     "purge": ("station.retention:purge", "delete a scan and its results"),
     "capture": ("station.capture:capture", "one camera's capture process"),
     "sync": ("station.sync:sync", "the sync-and-merge process"),

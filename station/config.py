@@ -92,6 +92,31 @@ class ScanConfig(_Strict):
     )
 
 
+class CalibrateConfig(_Strict):
+    """How the booth is calibrated."""
+
+    folder: Path = Field(default=Path("calibrations"), description="all dated calibrations")
+    ball_radius_m: float = Field(default=0.1, ge=0.03, le=0.3)
+    reference: str = Field(default="", description="the camera that the others are tied to first")
+    front: tuple[str, ...] = Field(
+        default=(), description="the cameras that face the person; default: named front..."
+    )
+    waving_s: float = Field(
+        default=60.0, ge=10.0, le=600.0, description="how long to wave the ball"
+    )
+    countdown_s: float = Field(
+        default=8.0, ge=0.0, le=60.0, description="to walk into the booth, or out of it"
+    )
+
+
+class DriftConfig(_Strict):
+    """Whether cameras still stand where they were calibrated."""
+
+    refuse_scans: bool = Field(
+        default=True, description="a scan is refused when its background says that a camera moved"
+    )
+
+
 class SpoolConfig(_Strict):
     """Where scans and results lie; one local file system (file locks and renames)."""
 
@@ -131,6 +156,8 @@ class BoothConfig(_Strict):
     volume: VolumeConfig = VolumeConfig()
     sync: SyncConfig = SyncConfig()
     scan: ScanConfig = ScanConfig()
+    calibrate: CalibrateConfig = CalibrateConfig()
+    drift: DriftConfig = DriftConfig()
     spool: SpoolConfig = SpoolConfig()
     workers: WorkersConfig = WorkersConfig()
     retention: RetentionConfig = RetentionConfig()
@@ -142,7 +169,22 @@ class BoothConfig(_Strict):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"the camera name {twice[0]} is used twice")
+        named = (*self.calibrate.front, *filter(None, [self.calibrate.reference]))
+        for name in named:
+            if name not in names:
+                raise ValueError(f"calibrate names {name}, which is not a camera here")
         return self
+
+    @property
+    def reference(self) -> str:
+        """The camera that the others are tied to first."""
+        return self.calibrate.reference or (self.front_cameras or (self.cameras[0].name,))[-1]
+
+    @property
+    def front_cameras(self) -> tuple[str, ...]:
+        """The cameras that face the person."""
+        names = tuple(camera.name for camera in self.cameras)
+        return self.calibrate.front or tuple(n for n in names if n.startswith("front"))
 
     def camera(self, name: str) -> CameraConfig:
         """A camera's section.
@@ -222,6 +264,9 @@ def _with_absolute_paths(config: BoothConfig, base: Path) -> BoothConfig:
         update={
             "cameras": cameras,
             "calibration": base / config.calibration,
+            "calibrate": config.calibrate.model_copy(
+                update={"folder": base / config.calibrate.folder}
+            ),
             "spool": config.spool.model_copy(update={"folder": base / config.spool.folder}),
             "runtime": config.runtime.model_copy(update={"folder": base / config.runtime.folder}),
         }

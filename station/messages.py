@@ -85,6 +85,24 @@ class CameraHealth(Message):
 
 
 @dataclass(frozen=True, slots=True)
+class SensorInfo(Message):
+    """Which sensor a camera is, with the lens that its driver knows; told beside its health."""
+
+    camera: str
+    serial: str
+    model: str
+    width: int
+    height: int
+    K: list[list[float]]
+    """Intrinsics of the depth image, 3x3, pixels."""
+    distortion: list[float]
+    """(k1, k2, p1, p2, k3) after OpenCV."""
+    depth_scale_m: float
+    tick_hz: float
+    tick_bits: int
+
+
+@dataclass(frozen=True, slots=True)
 class DesiredState(Message):
     """What the operator wants, repeated: capture processes follow it, however often it comes."""
 

@@ -6,6 +6,7 @@ each a one-line header `P5 640 480 65535` and little-endian 16-bit raw 11-bit di
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Iterable
@@ -39,15 +40,22 @@ def write_recording(
 ) -> int:
     """Write a recording, replacing one of the same name; returns how many frames it holds.
 
-    Further passes repeat the frames with times and ticks that go on, as hard links: a minute takes
-    no more disk than its first seconds.
+    Further passes repeat the frames with times and ticks that go on. Equal frames are hard links: a
+    minute takes no more disk than its first seconds.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     first: list[tuple[float, int, str]] = []
+    written: dict[bytes, str] = {}
     for frame in frames:
         name = _name(frame.seconds, frame.ticks, len(first))
-        (folder / name).write_bytes(_HEADER + frame.raw.astype("<u2").tobytes())
+        data = _HEADER + frame.raw.astype("<u2").tobytes()
+        digest = hashlib.sha256(data).digest()
+        if digest in written:
+            os.link(folder / written[digest], folder / name)
+        else:
+            (folder / name).write_bytes(data)
+            written[digest] = name
         first.append((frame.seconds, frame.ticks, name))
     names = [name for _, _, name in first]
     span_s = first[-1][0] - first[0][0]

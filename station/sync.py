@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from station.bundle import CapturedFrame, write_bundle
 from station.calibration.rig import Rig
+from station.calibration.store import CalibrationStore
+from station.calibration.watch import DriftWatch
 from station.config import BoothConfig, find_config, load_config
-from station.errors import BoothError
+from station.errors import BoothError, CalibrationError
 from station.frameset import Frameset, FramesetMatcher
 from station.live import merged_points
 from station.messages import CameraHealth, FrameHeader, Reply, Request, ScanEvent
@@ -78,6 +80,7 @@ class SyncProcess:
         self._latencies_s: list[float] = []
         self._live_s = 0.0
         self._rig: Rig | None = None
+        self._drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration), log)
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
@@ -215,6 +218,8 @@ class SyncProcess:
         writing.add_done_callback(lambda done: self._written(collection, done))
 
     def _write_bundle(self, collection: Collection, rig: Rig) -> None:
+        if self._config.drift.refuse_scans:
+            self._refuse_moved_cameras(collection, rig)
         spool = Spool(self._config.spool.folder)
         temporary = spool.temporary(collection.scan_id)
         frames = {
@@ -243,6 +248,27 @@ class SyncProcess:
         )
         spool.submit(temporary, collection.scan_id)
 
+    def _refuse_moved_cameras(self, collection: Collection, rig: Rig) -> None:
+        """A scan through a wrong calibration is worth nothing: say so while the person is there.
+
+        Raises:
+            CalibrationError: naming the cameras that moved.
+        """
+        moved = [
+            move.words()
+            for name in self._names
+            for move in self._drift.moves(
+                rig.cameras[name],
+                [found.frames[name].depth for found in collection.sets],
+                collection.sets[0].frames[name].header.depth_scale_m,
+            )
+            if move.moved or move.lost
+        ]
+        if moved:
+            raise CalibrationError(
+                f"{'; '.join(moved)}; look at it, then run station check, or station calibrate"
+            )
+
     def _written(self, collection: Collection, done: Future[None]) -> None:
         error = done.exception()
         if error is None:
@@ -252,6 +278,8 @@ class SyncProcess:
                 time.monotonic() - collection.complete_s,
             )
             self._end(collection, "accepted", "")
+        elif isinstance(error, BoothError):
+            self._end(collection, "failed", str(error))
         else:
             self._end(collection, "failed", f"the scan could not be written ({error}); scan again")
 

@@ -21,6 +21,7 @@ class Topic:
 TOPICS = {
     "depth": Topic("FrameHeader", 30.0, 1.0, 8, lossy=True),
     "health": Topic("CameraHealth", 2.0, 2.0, 8, lossy=True),
+    "sensor": Topic("SensorInfo", 2.0, 2.0, 8, lossy=True),
     "desired": Topic("DesiredState", 4.0, 2.0, 2, lossy=True),
     "scan": Topic("ScanEvent", 10.0, 1.0, 100, lossy=True),
     "cloud": Topic("points", 3.0, 2.0, 1, lossy=True),

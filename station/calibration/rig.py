@@ -25,24 +25,43 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DepthCorrection:
-    """A camera's systematic depth error: 1/z_true = sum_i a_i (1/z_measured)^i, z in metres."""
+    """A camera's systematic depth error, z in metres.
+
+    1/z_true = sum_i a_i (1/z_measured)^i + g . (x, y), with x and y from -1 to 1 over the image's
+    width and height.
+    """
 
     coefficients: tuple[float, ...] = ()
     """(a0, a1, ...); empty = no correction."""
+    image_gradient: tuple[float, float] = (0.0, 0.0)
+    """(gx, gy), 1/m: how much the error changes from the image's middle to its edges."""
 
     def apply(self, depth_m: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-        """Corrected depths, same shape and type; 0 (no reading) stays 0."""
+        """Corrected depths, same shape and type; 0 (no reading) stays 0.
+
+        Where there is an image gradient, depth_m must be a whole image (h, w).
+        """
         if not self.coefficients:
             return depth_m
         seen = depth_m > 0
         inverse = 1.0 / np.where(seen, depth_m, 1.0)
-        corrected = 1.0 / np.polynomial.polynomial.polyval(inverse, self.coefficients)
-        return np.where(seen, corrected, 0.0).astype(depth_m.dtype)
+        corrected = np.polynomial.polynomial.polyval(inverse, self.coefficients)
+        if any(self.image_gradient):
+            height, width = depth_m.shape
+            gx, gy = self.image_gradient
+            corrected = corrected + gx * np.linspace(-1.0, 1.0, width, dtype=np.float32)
+            corrected += gy * np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+        # A correction without sense at a depth it was not made for must not give points behind.
+        usable = seen & (corrected > 0)
+        return np.where(usable, 1.0 / np.where(usable, corrected, 1.0), 0.0).astype(depth_m.dtype)
 
     def to_json(self) -> dict[str, Any]:
         if not self.coefficients:
             return {"model": "none"}
-        return {"model": "inverse-depth-poly", "coefficients": list(self.coefficients)}
+        document = {"model": "inverse-depth-poly", "coefficients": list(self.coefficients)}
+        if any(self.image_gradient):
+            document["image_gradient"] = list(self.image_gradient)
+        return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +206,10 @@ def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
         coefficients = tuple(float(value) for value in fields["coefficients"])
         if not coefficients or not np.isfinite(coefficients).all():
             raise ValueError(f"camera {name}: depth_correction needs finite coefficients")
-        return DepthCorrection(coefficients)
+        gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
+        if len(gradient) != 2 or not np.isfinite(gradient).all():
+            raise ValueError(f"camera {name}: image_gradient must be two finite numbers")
+        return DepthCorrection(coefficients, (gradient[0], gradient[1]))
     raise ValueError(
         f"camera {name}: depth_correction model {model!r} is unknown "
         "(known: none, inverse-depth-poly)"

@@ -65,6 +65,33 @@ class VirtualFrame:
     raw: NDArray[np.uint16]
 
 
+@dataclass(frozen=True, slots=True)
+class SimulatedUnit:
+    """What distinguishes one sensor from the next of its kind."""
+
+    error: UnitError
+    drift: float
+    phase_s: float
+    first_tick: int
+
+    @classmethod
+    def of(cls, booth: SimulatedBooth, name: str) -> SimulatedUnit:
+        """A camera's unit; the same in every simulation of this booth."""
+        rng = np.random.default_rng((booth.seed, list(booth.rig.cameras).index(name), 1))
+        return cls(
+            error=UnitError(
+                booth.bias_m * rng.uniform(-1.0, 1.0), tuple(rng.uniform(-0.3, 0.3, 2))
+            ),
+            drift=rng.uniform(-80e-6, 80e-6),
+            phase_s=rng.uniform(0.0, 1.0 / FRAME_RATE_HZ),
+            first_tick=int(rng.integers(0, 2**32)),
+        )
+
+    def ticks(self, time_s: float) -> int:
+        """The device's counter, which wraps."""
+        return (self.first_tick + round(time_s * TICK_HZ * (1.0 + self.drift))) % 2**32
+
+
 class VirtualCamera:
     """One simulated unit in front of a body; the same seed gives the same frames."""
 
@@ -72,26 +99,19 @@ class VirtualCamera:
         camera = booth.rig.cameras[name]
         index = list(booth.rig.cameras).index(name)
         self._rng = np.random.default_rng((booth.seed, index))
-        unit = np.random.default_rng((booth.seed, index, 1))
         self._booth, self._camera = booth, camera
-        self._unit = UnitError(
-            booth.bias_m * unit.uniform(-1.0, 1.0), tuple(unit.uniform(-0.3, 0.3, 2))
-        )
-        self.drift = unit.uniform(-80e-6, 80e-6)
-        self.phase_s = unit.uniform(0.0, 1.0 / FRAME_RATE_HZ)
-        self._first_tick = int(unit.integers(0, 2**32))
+        self.unit = SimulatedUnit.of(booth, name)
         self._views = _sway_views(booth, camera, body)
 
     def frames(self, count: int) -> Iterator[VirtualFrame]:
         """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
         for sequence in range(count):
-            time_s = self.phase_s + sequence / FRAME_RATE_HZ
+            time_s = self.unit.phase_s + sequence / FRAME_RATE_HZ
             phase = int(time_s / _SWAY_PERIOD_S * len(self._views)) % len(self._views)
-            raw = observe(self._views[phase], self._unit, self._rng)
+            raw = observe(self._views[phase], self.unit.error, self._rng)
             if self._rng.random() < self._booth.drop_rate:
                 continue
-            ticks = (self._first_tick + round(time_s * TICK_HZ * (1.0 + self.drift))) % 2**32
-            yield VirtualFrame(time_s, ticks, sequence, raw)
+            yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
 
 
 def _sway_views(
@@ -171,8 +191,8 @@ class VirtualDriver:
             raise DriverError(f"camera {self._name}: the virtual booth has only {known}")
         camera = VirtualCamera(booth, self._name, load_mesh(self._body))
         self._loop = list(camera.frames(_LIVE_LOOP_FRAMES))
-        self._drift, self._first = camera.drift, self._loop[0].ticks
-        self._start_s = time.monotonic() + camera.phase_s
+        self._unit = camera.unit
+        self._start_s = time.monotonic() + camera.unit.phase_s
         self._sequence = 0
         calibration = booth.rig.cameras[self._name]
         return DeviceInfo(
@@ -195,7 +215,7 @@ class VirtualDriver:
             return None
         time.sleep(max(wait_s, 0.0))
         frame = self._loop[self._sequence % len(self._loop)]
-        ticks = (self._first + round(due_s * TICK_HZ * (1.0 + self._drift))) % 2**32
+        ticks = self._unit.ticks(self._unit.phase_s + due_s)
         result = DepthFrame(TABLE[frame.raw], ticks, time.monotonic(), self._sequence)
         self._sequence += 1
         return result

@@ -46,6 +46,16 @@ class TrueView:
 
 
 @dataclass(frozen=True, slots=True)
+class Window:
+    """Where a part of an image lies in the whole."""
+
+    top: int
+    left: int
+    image_height: int
+    image_width: int
+
+
+@dataclass(frozen=True, slots=True)
 class UnitError:
     """One sensor's smooth systematic depth error."""
 
@@ -54,19 +64,27 @@ class UnitError:
     tilt: tuple[float, float] = (0.0, 0.0)
     """How much it changes over the image, relative, per half width and half height."""
 
-    def apply(self, depth_m: Image) -> Image:
+    def apply(self, depth_m: Image, window: Window | None = None) -> Image:
+        """The depths that the unit reports; of a part of the image where a window is given."""
         if self.bias_m == 0.0:
             return depth_m
+        window = window or Window(0, 0, *depth_m.shape)
         height, width = depth_m.shape
-        x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
-        y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
-        shape = 1.0 + self.tilt[0] * x + self.tilt[1] * y
+        x = np.linspace(-1.0, 1.0, window.image_width, dtype=np.float32)
+        y = np.linspace(-1.0, 1.0, window.image_height, dtype=np.float32)
+        shape = (
+            1.0
+            + self.tilt[0] * x[None, window.left : window.left + width]
+            + self.tilt[1] * y[window.top : window.top + height, None]
+        )
         return np.asarray(depth_m + self.bias_m * shape * np.square(depth_m / 2.0), np.float32)
 
 
-def observe(view: TrueView, unit: UnitError, rng: np.random.Generator) -> NDArray[np.uint16]:
+def observe(
+    view: TrueView, unit: UnitError, rng: np.random.Generator, window: Window | None = None
+) -> NDArray[np.uint16]:
     """One noisy raw 11-bit frame (h, w) of what a perfect sensor would see."""
-    depth = unit.apply(view.depth_m)
+    depth = unit.apply(view.depth_m, window)
     seen = (depth > 0) & view.lit & view.reflects
     white = rng.standard_normal(depth.shape, dtype=np.float32)
     blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)

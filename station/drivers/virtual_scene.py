@@ -99,6 +99,16 @@ def booth_walls() -> tuple[Mesh, ...]:
     )
 
 
+def fixed_posts() -> tuple[Mesh, ...]:
+    """Square posts behind the cameras, on which these hang: each camera sees those opposite."""
+    half = 0.04
+    return tuple(
+        box((x - half, y - half, 0.0), (x + half, y + half, 2.2))
+        for x in (-0.45, 0.45)
+        for y in (-1.75, 1.75)
+    )
+
+
 def chair(at_m: tuple[float, float]) -> tuple[Mesh, ...]:
     """A stool with a back, at a place on the floor."""
     x, y = at_m

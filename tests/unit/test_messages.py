@@ -2,10 +2,11 @@ import msgpack
 import pytest
 
 from station.errors import FormatError
-from station.messages import CameraHealth, DesiredState, Reply, Request, ScanEvent
+from station.messages import CameraHealth, DesiredState, Reply, Request, ScanEvent, SensorInfo
 
 _EXAMPLES = [
     CameraHealth("front", "lost", "unplugged", 10, 1, 0),
+    SensorInfo("front", "A1", "kinect-v1", 2, 1, [[1.0, 0.0, 0.5]], [0.0], 1e-4, 6e7, 32),
     DesiredState(True),
     Request("scan", "20260101T000000Z-0001", "Zoë"),
     Reply(ok=False, error="no", content={"a": [1, 2]}),

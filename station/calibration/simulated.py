@@ -1,0 +1,66 @@
+"""A calibration of the virtual booth without an operator: every step's frames, detected at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.ball import find_ball
+from station.calibration.detections import BallDetection, Observations, PlaneObservation
+from station.calibration.planes import observe_floor, observe_wall
+from station.calibration.rig import CameraCalibration
+from station.clock import DeviceClock
+from station.depth.average import average
+from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
+from station.drivers.virtual import TICK_HZ
+from station.drivers.virtual_calibration import BALL, EMPTY, FRONT, MARK, VirtualProcedure
+
+_TRANSPORT_S = (0.004, 0.0015)
+"""Least delay from exposure to host, and the mean of what comes on top."""
+_LOOK_S = 1.0
+
+
+def simulate(
+    procedure: VirtualProcedure, camera: CameraCalibration, *, stride: int = 2
+) -> Observations:
+    """What one camera contributes: ball every stride-th frame, mark, floor, boards."""
+    name = camera.name
+    index = list(procedure.booth.rig.cameras).index(name)
+    rng = np.random.default_rng((procedure.booth.seed, index, 4))
+    clock = DeviceClock(TICK_HZ, 32)
+
+    def timed(step: str, limit_s: float | None, every: int) -> Iterator[tuple[float, _Depth]]:
+        for frame in procedure.frames(name, step, stride=every, limit_s=limit_s):
+            delay_s = _TRANSPORT_S[0] + rng.exponential(_TRANSPORT_S[1])
+            time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)
+            yield time_s, (TABLE[frame.raw] * np.float32(DEPTH_SCALE_M)).astype(np.float32)
+
+    def still(step: str) -> NDArray[np.uint16]:
+        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, None, 1)])
+        return stack.astype(np.uint16)
+
+    empty = still(EMPTY)
+    background = average(empty, DEPTH_SCALE_M).depth_m
+
+    def balls(step: str, limit_s: float | None, every: int) -> list[BallDetection]:
+        found = (
+            find_ball(depth, camera, procedure.radius_m, time_s, background)
+            for time_s, depth in timed(step, limit_s, every)
+        )
+        return [detection for detection in found if detection is not None]
+
+    planes: list[PlaneObservation | None] = [observe_floor(empty, DEPTH_SCALE_M, camera)]
+    waved, mark, front = (
+        balls(BALL, None, stride),
+        balls(MARK, _LOOK_S, 2),
+        balls(FRONT, _LOOK_S, 2),
+    )
+    for step in procedure.steps:
+        if step.startswith("wall-"):
+            planes.append(observe_wall(still(step), DEPTH_SCALE_M, camera, step, background))
+    return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
+
+
+_Depth = NDArray[np.float32]

@@ -1,0 +1,133 @@
+"""All calibrations of a booth, each in a folder named by its date; none is ever overwritten.
+
+calibrations/20261121T100000Z/   calibration.json, report.json, what it was solved from
+calibrations/unfinished/         the one that is being done
+calibration.json                 a copy of the one in use
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from station.calibration.rig import Rig
+from station.calibration.scene import StaticView
+from station.calibration.session import SCENE
+from station.errors import CalibrationError
+from station.files import fsync_folder, private_folder, publish_folder, write_bytes, write_json
+
+CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
+_ABANDONED = "abandoned-"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One stored calibration."""
+
+    name: str
+    """Its date: 20261121T100000Z."""
+    folder: Path
+    rig: Rig
+    in_use: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationStore:
+    """The folder of dated calibrations, and the file that the booth reads."""
+
+    folder: Path
+    in_use: Path
+
+    @property
+    def unfinished(self) -> Path:
+        """Where the calibration that is being done keeps what it has seen."""
+        return self.folder / UNFINISHED
+
+    def entries(self) -> list[Entry]:
+        """All stored calibrations, oldest first."""
+        if not self.folder.is_dir():
+            return []
+        used = self.in_use.read_bytes() if self.in_use.exists() else None
+        return [
+            Entry(path.parent.name, path.parent, Rig.load(path), in_use=path.read_bytes() == used)
+            for path in sorted(self.folder.glob(f"*/{CALIBRATION}"))
+            if not path.parent.name.startswith((UNFINISHED, _ABANDONED, "."))
+        ]
+
+    def finish(self, rig: Rig, report: dict[str, Any]) -> Entry:
+        """Give the unfinished calibration its date and put it beside the others.
+
+        Raises:
+            CalibrationError: there is one of the same second already.
+        """
+        rig.save(self.unfinished / CALIBRATION)
+        write_json(self.unfinished / REPORT, report)
+        final = self.folder / dated(rig.created)
+        try:
+            publish_folder(self.unfinished, final)
+        except FileExistsError as cause:
+            raise CalibrationError(f"{cause}; solve again in a second") from None
+        return Entry(final.name, final, rig, in_use=False)
+
+    def set_aside(self) -> Path | None:
+        """Make room for a new calibration; what an unfinished one has seen is kept."""
+        if not self.unfinished.exists():
+            return None
+        number = 1
+        while (aside := self.folder / f"{_ABANDONED}{number}").exists():
+            number += 1
+        os.rename(self.unfinished, aside)
+        fsync_folder(self.folder)
+        return aside
+
+    def use(self, name: str) -> Entry:
+        """Make a stored calibration the one that the booth reads.
+
+        A calibration.json that came from elsewhere is put into the store first.
+
+        Raises:
+            CalibrationError: there is none of that name; names those that there are.
+        """
+        entries = self.entries()
+        found = next((entry for entry in entries if entry.name == name), None)
+        if found is None:
+            known = ", ".join(entry.name for entry in entries) or "none"
+            raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
+        if self.in_use.exists() and not any(entry.in_use for entry in entries):
+            self._adopt()
+        write_bytes(self.in_use, (found.folder / CALIBRATION).read_bytes())
+        return Entry(found.name, found.folder, found.rig, in_use=True)
+
+    def _adopt(self) -> None:
+        """Keep the file in use, which is not one of ours, under the date that it bears."""
+        name = dated(Rig.load(self.in_use).created)
+        folder, number = self.folder / f"{name}-found", 1
+        while folder.exists():
+            number += 1
+            folder = self.folder / f"{name}-found-{number}"
+        temporary = private_folder(self.folder / f".{folder.name}.{os.getpid()}")
+        shutil.copyfile(self.in_use, temporary / CALIBRATION)
+        publish_folder(temporary, folder)
+
+    def scene(self) -> dict[str, StaticView]:
+        """The empty booth as it was at the calibration in use; nothing where none was stored.
+
+        Raises:
+            FormatError: naming the file that cannot be read.
+        """
+        for entry in self.entries():
+            if entry.in_use:
+                views = sorted((entry.folder / SCENE).glob("*.npz"))
+                return {path.stem: StaticView.load(path) for path in views}
+        return {}
+
+
+def dated(created: str) -> str:
+    """A folder's name from an ISO 8601 date: 2026-11-21T10:00:00Z -> 20261121T100000Z."""
+    name = "".join(character for character in created if character.isalnum())
+    if not name:
+        raise CalibrationError("a calibration without a date cannot be stored")
+    return name

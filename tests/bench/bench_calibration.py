@@ -1,0 +1,244 @@
+"""The calibration of simulated booths, from images: poses, their covariances, what a scan gains.
+
+Each booth is put up differently, its sensors err by up to 15 mm at 2 m, tilted over the image, and
+their clocks drift. A person waves a ball through it for 60 s, then come mark, floor and board.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import bench_drift
+import synthetic_calibration as synthetic
+
+from station.bundle import read_bundle
+from station.calibration.detections import Observations
+from station.calibration.rig import DepthCorrection, Rig
+from station.calibration.simulated import simulate
+from station.calibration.solve import solve
+from station.calibration.world import relatives, twist_between
+from station.depth import preprocess
+from station.drivers.virtual import SimulatedBooth, SimulatedUnit, render_bundle
+from station.drivers.virtual_calibration import VirtualProcedure
+from station.drivers.virtual_scene import Mesh, load_mesh
+from station.errors import CalibrationError
+from station.geometry import invert
+
+Array = NDArray[np.float64]
+
+_BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+_STRIDE = 3
+"""Ten frames a second."""
+_CYLINDER_M = (0.15, 1.7)
+_REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One booth."""
+
+    seed: int
+    shift_mm: Array
+    """Of each pair of cameras."""
+    turn_deg: Array
+    normalised: float
+    """Squared error of all poses relative to the reference's, in units of their covariance."""
+    unknowns: int
+    cylinder_mm: float
+    body_mm: float
+    body_true_mm: float
+    seconds: float
+
+
+def calibrate(seed: int) -> Row | str:
+    """Simulate, solve and judge one booth; words if it is refused."""
+    booth = synthetic.booth(seed)
+    procedure = VirtualProcedure(booth)
+    cameras = synthetic.factory(booth.rig)
+    seen = [simulate(procedure, camera, stride=_STRIDE) for camera in cameras.values()]
+    observations = Observations(
+        *([one for part in seen for one in getattr(part, name)] for name in ("balls", "mark")),
+        [one for part in seen for one in part.front],
+        [one for part in seen for one in part.planes],
+    )
+    start_s = time.perf_counter()
+    try:
+        solution = solve(
+            observations, cameras, radius_m=procedure.radius_m, reference=_REFERENCE,
+            front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
+        )  # fmt: skip
+    except CalibrationError as refusal:
+        return f"{seed:<7}refused: {refusal}"
+    seconds = time.perf_counter() - start_s
+    names, truth = list(cameras), booth.rig.cameras
+    errors = []
+    for i, a in enumerate(names):
+        found, _ = relatives(solution.placed, a, names[i + 1 :])
+        for b, a_from_b in zip(names[i + 1 :], found, strict=True):
+            true = invert(truth[a].world_from_camera) @ truth[b].world_from_camera
+            errors.append(twist_between(a_from_b, true))
+    others = [name for name in names if name != _REFERENCE]
+    found, covariance = relatives(solution.placed, _REFERENCE, others)
+    away = np.concatenate(
+        [
+            twist_between(
+                pose, invert(truth[_REFERENCE].world_from_camera) @ truth[b].world_from_camera
+            )
+            for b, pose in zip(others, found, strict=True)
+        ]
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        cylinder_mm = _cylinder(booth, solution.rig, Path(folder) / "cylinder")
+        body_mm, body_true_mm = _body(booth, solution.rig, Path(folder) / "body")
+    twists = np.array(errors)
+    return Row(
+        seed,
+        1e3 * np.linalg.norm(twists[:, 3:], axis=1),
+        np.degrees(np.linalg.norm(twists[:, :3], axis=1)),
+        float(away @ np.linalg.solve(covariance, away)),
+        len(away),
+        cylinder_mm,
+        body_mm,
+        body_true_mm,
+        seconds,
+    )
+
+
+def true_rig(booth: SimulatedBooth) -> Rig:
+    """Poses and depth corrections as they are."""
+    cameras = {}
+    for name, camera in booth.rig.cameras.items():
+        error = SimulatedUnit.of(booth, name).error
+        shift = error.bias_m / 4.0
+        correction = DepthCorrection((shift, 1.0), (shift * error.tilt[0], shift * error.tilt[1]))
+        cameras[name] = replace(camera, depth_correction=correction)
+    return replace(booth.rig, cameras=cameras)
+
+
+def _cylinder(booth: SimulatedBooth, rig: Rig, folder: Path) -> float:
+    """Rms distance of merged points from a cylinder on the mark, mm."""
+    radius, height = _CYLINDER_M
+    shape = o3d.geometry.TriangleMesh.create_cylinder(radius, height, 360, 1)
+    mesh = Mesh(
+        (*np.asarray(shape.vertices), 0.0, 0.0, height / 2 + 0.05),
+        np.asarray(shape.triangles, np.int32),
+    )
+    points = _cloud(booth, rig, mesh, folder)
+    side = points[(points[:, 2] > 0.2) & (points[:, 2] < height - 0.1)]
+    return 1e3 * float(np.sqrt(np.mean((np.hypot(side[:, 0], side[:, 1]) - radius) ** 2)))
+
+
+def _body(booth: SimulatedBooth, rig: Rig, folder: Path) -> tuple[float, float]:
+    """Rms distance of a scanned body's points from it, by the found and by the true rig, mm."""
+    body = load_mesh(_BODY)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(body.vertices.astype(np.float32), body.faces.astype(np.uint32))
+    found = []
+    for name, used in (("found", rig), ("true", true_rig(booth))):
+        points = _cloud(booth, used, body, folder.with_name(name)).astype(np.float32)
+        away = scene.compute_distance(o3d.core.Tensor(points)).numpy()
+        found.append(1e3 * float(np.sqrt(np.mean(away**2))))
+    return found[0], found[1]
+
+
+def _cloud(booth: SimulatedBooth, rig: Rig, mesh: Mesh, folder: Path) -> Array:
+    still = replace(booth, sway_m=0.0)
+    bundle = read_bundle(render_bundle(mesh, folder, still))
+    return preprocess(replace(bundle, rig=rig)).cloud.points
+
+
+def refusals() -> None:
+    """What must not become a calibration, and what the operator reads."""
+    procedure = VirtualProcedure(synthetic.booth(101))
+    seen = synthetic.observations(procedure)
+    cameras = synthetic.factory(procedure.booth.rig)
+    print("\nrefused")
+    for fault in synthetic.FAULTS:
+        try:
+            solve(
+                fault.spoil(seen), cameras, radius_m=fault.radius_m, reference=_REFERENCE,
+                front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
+            )  # fmt: skip
+            print(f"  MISSED  {fault.name}")
+        except CalibrationError as refusal:
+            print(
+                f"  {'met' if fault.words in str(refusal) else 'MISSED'}  {fault.name}: {refusal}"
+            )
+
+
+def _bar(text: str, value: float, limit: float, form: str = ".2f") -> None:
+    verdict = "met" if value <= limit else "MISSED"
+    print(f"  {text:<58}{value:>9{form}}  <= {limit:<7g}{verdict}")
+
+
+def summary(rows: Sequence[Row], booths: int) -> None:
+    """The bars."""
+    shift = np.concatenate([row.shift_mm for row in rows])
+    turn = np.concatenate([row.turn_deg for row in rows])
+    print(f"\n{len(rows)} of {booths} booths, all six pairs of cameras")
+    _bar("sound booths refused", booths - len(rows), 0, ".0f")
+    _bar("relative poses, mean (mm)", shift.mean(), 1.0)
+    _bar("relative poses, worst (mm)", shift.max(), 2.0)
+    _bar("relative poses, mean (degrees)", turn.mean(), 0.05, ".3f")
+    _bar("relative poses, worst (degrees)", turn.max(), 0.1, ".3f")
+    _bar("points off a known cylinder, worst (mm rms)", max(r.cylinder_mm for r in rows), 1.5)
+    worse = [row.body_mm - row.body_true_mm for row in rows]
+    _bar("a body's cloud worse than by the true rig, worst (mm rms)", max(worse), 0.5)
+    _bar("solving, worst (s)", max(row.seconds for row in rows), 10.0)
+    total, unknowns = sum(r.normalised for r in rows), sum(r.unknowns for r in rows)
+    low, high = chi2.ppf([0.025, 0.975], unknowns)
+    verdict = "met" if low <= total <= high else "MISSED"
+    print(
+        f"  chi-square of the normalised errors {total:.0f}, its 95 % band "
+        f"{low:.0f} to {high:.0f}  {verdict}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--booths", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first booth")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--scans", type=int, default=300, help="for the drift check; 0 = without")
+    arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.booths)
+    print(
+        f"{'booth':<7}{'mm mean':>9}{'worst':>7}{'deg mean':>10}{'worst':>7}{'chi2/n':>8}"
+        f"{'cylinder':>10}{'body':>7}{'true':>7}{'s':>6}"
+    )
+    rows = []
+    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
+        for row in pool.imap(calibrate, seeds):
+            if isinstance(row, str):
+                print(row, flush=True)
+                continue
+            rows.append(row)
+            print(
+                f"{row.seed:<7}{row.shift_mm.mean():9.2f}{row.shift_mm.max():7.2f}"
+                f"{row.turn_deg.mean():10.3f}{row.turn_deg.max():7.3f}"
+                f"{row.normalised / row.unknowns:8.2f}{row.cylinder_mm:10.2f}{row.body_mm:7.2f}"
+                f"{row.body_true_mm:7.2f}{row.seconds:6.1f}",
+                flush=True,
+            )
+    summary(rows, len(seeds))
+    refusals()
+    if arguments.scans:
+        bench_drift.report(arguments.scans, max(10, arguments.scans // 10))
+
+
+if __name__ == "__main__":
+    main()

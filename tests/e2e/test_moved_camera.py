@@ -1,0 +1,105 @@
+"""A camera that somebody bumped into: named by the check, and before a scan is accepted."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from station.calibration.scene import static_view
+from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
+from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
+from station.drivers.virtual_scene import Mesh, fixed_posts, load_mesh
+from station.recording import write_recording
+
+STATION = (sys.executable, "-m", "station.cli")
+BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+BUMPED = {"front-upper": (0.006, 0.004)}
+"""6 mm and 0.23 degrees."""
+
+
+def _record(folder: Path, body: Mesh | None, moved: dict[str, tuple[float, float]]) -> None:
+    booth = SimulatedBooth(seed=9, clutter=fixed_posts(), moved_cameras=moved, sway_m=0.0)
+    camera = VirtualCamera(booth, folder.name, body)
+    write_recording(folder, recorded_frames(camera, 12), tick_hz=TICK_HZ, passes=200)
+
+
+@pytest.fixture(scope="module")
+def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of one camera after somebody bumped into it."""
+    folder = tmp_path_factory.mktemp("bumped") / "front-upper"
+    _record(folder, load_mesh(BODY), BUMPED)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the cameras see of the empty booth."""
+    folder = tmp_path_factory.mktemp("scene")
+    empty = SimulatedBooth(clutter=fixed_posts())
+    for name in empty.rig.cameras:
+        frames = VirtualCamera(empty, name, None).frames(20)
+        static_view((TABLE[frame.raw] for frame in frames), DEPTH_SCALE_M).save(
+            folder / f"{name}.npz"
+        )
+    return folder
+
+
+@pytest.fixture
+def calibrated(booth: Path, scene: Path, tmp_path: Path) -> Path:
+    """The store of a booth whose empty scene was kept when it was calibrated."""
+    entry = tmp_path / "calibrations/20260101T000000Z"
+    shutil.copytree(scene, entry / "scene")
+    shutil.copyfile(booth / "calibration.json", entry / "calibration.json")
+    return entry
+
+
+def _recorded(text: str) -> str:
+    return text.replace('"freenect"', '"recorded"')
+
+
+def test_a_scan_is_refused_when_a_camera_has_moved(
+    make_station: Callable[..., object], booth: Path, bumped: Path, calibrated: Path
+) -> None:
+    station = make_station(
+        "[workers]\ncount = 0",
+        lambda text: _recorded(text).replace(f"{booth}/front-upper", str(bumped)),
+    )
+    assert calibrated.exists()
+    assert station.command("start").returncode == 0
+    done = station.command("scan")
+    assert done.returncode == 1
+    assert "camera front-upper has moved since it was calibrated" in done.stderr
+    assert "station calibrate" in done.stderr
+    assert not any(name in done.stderr for name in ("front-lower", "back-lower", "back-upper"))
+    assert not list((station.config.parent / "spool/queue").iterdir())
+    checked = station.command("check")
+    assert checked.returncode == 3
+    assert "camera front-upper has moved" in checked.stdout
+    assert "camera back-upper stands where it was calibrated" in checked.stdout
+
+
+def test_a_scan_is_accepted_when_none_has(
+    make_station: Callable[..., object], calibrated: Path
+) -> None:
+    station = make_station("[workers]\ncount = 0", _recorded)
+    assert calibrated.exists()
+    assert station.command("start").returncode == 0
+    done = station.command("scan", "--no-wait")
+    assert done.returncode == 0, done.stderr
+    checked = station.command("check", "--json")
+    assert checked.returncode == 0, checked.stdout
+    assert '"moved": false' in checked.stdout
+
+
+def test_a_calibration_without_its_empty_booth_cannot_be_checked(booth: Path) -> None:
+    done = subprocess.run(
+        [*STATION, "check", "--config", str(booth / "booth.toml")],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "no picture of the empty booth" in done.stderr

@@ -1,0 +1,128 @@
+"""A calibration that is interrupted, killed or misses something: nothing that was seen is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from station.calibration.session import BALL, EMPTY, JOURNAL, Session
+from station.drivers.virtual import TICK_HZ
+from station.drivers.virtual_calibration import VirtualProcedure
+from station.recording import RecordedFrame, write_recording
+
+STATION = (sys.executable, "-m", "station.cli")
+CAMERAS = ("front-lower", "front-upper")
+WAVING_S = 5.0
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cameras' empty booth and a ball that is waved for a few seconds."""
+    folder = tmp_path_factory.mktemp("procedure")
+    procedure = VirtualProcedure(waving_s=WAVING_S)
+    for step, stride in ((EMPTY, 2), (BALL, 3)):
+        for name in CAMERAS:
+            frames = procedure.frames(name, step, stride=stride)
+            write_recording(
+                folder / step / name,
+                (RecordedFrame(frame.time_s, frame.ticks, frame.raw) for frame in frames),
+                tick_hz=TICK_HZ,
+            )
+    return folder
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "booth.toml"
+    lines = ["[calibrate]", "waving_s = 10"]
+    for name in CAMERAS:
+        lines += ["[[cameras]]", f'name = "{name}"', 'driver = "recorded"', 'recording = "none"']
+    path.write_text("\n".join(lines))
+    return path
+
+
+def _command(config: Path, recordings: Path, *words: str) -> list[str]:
+    return [*STATION, "calibrate", *words, "--config", str(config), "--recordings", str(recordings)]
+
+
+def _run(config: Path, recordings: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        _command(config, recordings, *words),
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_killed_while_the_ball_is_waved(config: Path, recordings: Path) -> None:
+    """kill -9: what was seen up to a second before is there, and the next run adds to it."""
+    folder = config.parent / "calibrations/unfinished"
+    done = _run(config, recordings, "floor")
+    assert done.returncode == 0, done.stderr
+    assert "empty booth kept" in done.stdout
+    waving = subprocess.Popen(
+        _command(config, recordings, "ball"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline_s = time.monotonic() + 60.0
+    while '"step":"ball"' not in (folder / JOURNAL).read_text():
+        assert time.monotonic() < deadline_s
+        assert waving.poll() is None
+        time.sleep(0.05)
+    os.kill(waving.pid, signal.SIGKILL)
+    waving.wait()
+    seen = len(Session.load(folder).balls)
+    assert seen > 0
+    again = _run(config, recordings, "ball")
+    assert again.returncode == 0, again.stderr
+    session = Session.load(folder)
+    assert len(session.balls) > seen
+    assert session.runs == 2
+    assert session.done(EMPTY)
+    refused = _run(config, recordings, "solve")
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("error: ")
+    assert refused.stderr.count("\n") == 1
+    assert len(Session.load(folder).balls) == len(session.balls)
+    assert not (config.parent / "calibration.json").exists()
+
+
+def test_a_missing_camera_is_named_and_nothing_is_lost(
+    config: Path, recordings: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(recordings / EMPTY, copy / EMPTY, copy_function=os.link)
+    shutil.rmtree(copy / EMPTY / "front-upper")
+    done = _run(config, copy, "floor")
+    assert done.returncode == 1
+    assert "front-upper" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_steps_in_the_wrong_order_say_which_comes_first(config: Path, recordings: Path) -> None:
+    done = subprocess.run(
+        [*STATION, "calibrate", "solve", "--config", str(config)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "no calibration has been begun" in done.stderr
+    moved = config.parent / "only-ball"
+    shutil.copytree(recordings / BALL, moved / "wall-0", copy_function=os.link)
+    done = _run(config, moved, "depth")
+    assert done.returncode == 1
+    assert "something moved" in done.stderr or "station calibrate floor" in done.stderr
+
+
+def test_another_ball_is_not_mixed_in(config: Path, recordings: Path) -> None:
+    assert _run(config, recordings, "floor").returncode == 0
+    config.write_text(config.read_text().replace("[calibrate]", "[calibrate]\nball_radius_m = 0.2"))
+    done = _run(config, recordings, "ball")
+    assert done.returncode == 1
+    assert "ball of 0.1 m and booth.toml says 0.2 m" in done.stderr
+    anew = _run(config, config.parent, "--new")
+    assert "what was seen so far is kept" in anew.stdout
+    assert (config.parent / "calibrations/abandoned-1/scene/front-lower.npz").exists()

@@ -1,0 +1,142 @@
+"""What `station calibrate` says when nothing has to be seen for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from station.calibration.board import Board
+from station.calibration.calibrate_cli import calibrate
+from station.calibration.guide import Guide
+from station.calibration.rig import Rig
+from station.calibration.session import Session
+from station.calibration.store import CalibrationStore
+from station.drivers.virtual_scene import default_rig
+from station.errors import BoothError, CalibrationError
+
+CAMERAS = default_rig().cameras
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "booth.toml"
+    path.write_text(
+        "".join(
+            f'[[cameras]]\nname = "{name}"\ndriver = "recorded"\nrecording = "{name}"\n'
+            for name in CAMERAS
+        )
+    )
+    return path
+
+
+@pytest.fixture
+def store(config: Path) -> CalibrationStore:
+    return CalibrationStore(config.parent / "calibrations", config.parent / "calibration.json")
+
+
+def _run(config: Path, *words: str) -> Result:
+    return CliRunner().invoke(calibrate, [*words, "--config", str(config)])
+
+
+def _begin(store: CalibrationStore) -> Session:
+    return Session.begin(store.unfinished, "2026-11-21T10:00:00Z", 0.1, CAMERAS)
+
+
+def test_stored_calibrations_are_listed_and_put_into_use(
+    config: Path, store: CalibrationStore
+) -> None:
+    for day in (1, 2):
+        _begin(store)
+        store.finish(replace(default_rig(), created=f"2026-11-0{day}T10:00:00Z"), {})
+    _begin(store)
+    used = _run(config, "--use", "20261101T100000Z")
+    assert used.exit_code == 0, used.output
+    assert Rig.load(store.in_use).created == "2026-11-01T10:00:00Z"
+    listed = _run(config, "--list").output.splitlines()
+    assert listed[0].startswith("* 20261101T100000Z  4 cameras")
+    assert listed[1].startswith("  20261102T100000Z")
+    assert "unfinished, begun 2026-11-21T10:00:00Z" in listed[2]
+    wrong = _run(config, "--use", "yesterday")
+    assert isinstance(wrong.exception, CalibrationError)
+    assert "20261101T100000Z, 20261102T100000Z" in str(wrong.exception)
+
+
+def test_a_step_reads_its_own_configuration(tmp_path: Path) -> None:
+    """The group once read booth.toml before the step could say which."""
+    missing = CliRunner().invoke(calibrate, ["solve", "--config", str(tmp_path / "other.toml")])
+    assert isinstance(missing.exception, BoothError)
+    assert "other.toml" in str(missing.exception)
+
+
+def _draw_boards(folder: Path, board: Board) -> None:
+    for name in CAMERAS:
+        (folder / name).mkdir(parents=True)
+        image = board.printed().generateImage((560, 400), marginSize=20)
+        canvas = np.full((480, 640), 200, np.uint8)
+        canvas[40:440, 40:600] = image
+        cv2.imwrite(str(folder / name / "000.png"), canvas)
+
+
+def test_a_board_is_looked_for_in_a_folder_of_images(config: Path, store: CalibrationStore) -> None:
+    images = config.parent / "images"
+    _draw_boards(images, Board(7, 5, 0.06, 0.045))
+    before = _run(config, "board", "--images", str(images))
+    assert "no calibration has been begun" in str(before.exception)
+    _begin(store)
+    done = _run(config, "board", "--images", str(images))
+    assert done.exit_code == 0, done.output
+    assert "camera front-lower: the board is seen in 1 images" in done.output
+    assert "the factory's lens is kept, 12 are needed" in done.output
+    assert Session.load(store.unfinished).lenses == {}
+
+
+@pytest.mark.parametrize(
+    ("squares", "words"),
+    [
+        ("9x6", "board of another size"),
+        ("seven", "across x down"),
+        ("6x4", "board of another size"),
+    ],
+)
+def test_a_board_that_is_not_the_one_given_is_refused(
+    config: Path, store: CalibrationStore, squares: str, words: str
+) -> None:
+    images = config.parent / "images"
+    _draw_boards(images, Board(7, 5, 0.06, 0.045))
+    _begin(store)
+    done = _run(config, "board", "--images", str(images), "--squares", squares)
+    assert isinstance(done.exception, CalibrationError)
+    assert words in str(done.exception)
+
+
+def test_images_that_cannot_be_used_are_named(config: Path, store: CalibrationStore) -> None:
+    images = config.parent / "images"
+    (images / "front-lower").mkdir(parents=True)
+    _begin(store)
+    nothing = _run(config, "board", "--images", str(images))
+    assert "no image of the board" in str(nothing.exception)
+    path = images / "front-lower/a.png"
+    cv2.imwrite(str(path), np.zeros((100, 100), np.uint8))
+    assert "a.png is 100 x 100; camera front-lower has 640 x 480" in str(
+        _run(config, "board", "--images", str(images)).exception
+    )
+    path.write_bytes(b"no image")
+    assert "cannot be read as an image" in str(
+        _run(config, "board", "--images", str(images)).exception
+    )
+
+
+def test_nobody_is_waited_for_unattended(capsys: pytest.CaptureFixture[str]) -> None:
+    guide = Guide(attended=False, countdown_s=60.0)
+    guide.step("Ball", "Wave it.")
+    for second in range(100):
+        guide.progress(f"{second} s")
+    guide.done("seen")
+    assert not guide.another("Once more?")
+    lines = capsys.readouterr().out.split("\n")
+    assert lines == ["", "Ball", "  Wave it.", "  0 s", "  seen", ""]

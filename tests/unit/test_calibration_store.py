@@ -1,0 +1,204 @@
+"""Dated calibrations: none is lost, none is overwritten; work in progress survives a crash."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.calibration.coverage import Coverage
+from station.calibration.detections import BallDetection, PlaneObservation
+from station.calibration.rig import Rig
+from station.calibration.scene import static_view
+from station.calibration.session import EMPTY, JOURNAL, MARK, SENSORS, Lens, Session
+from station.calibration.store import CalibrationStore
+from station.drivers.virtual_scene import default_rig
+from station.errors import CalibrationError, FormatError
+
+CAMERAS = default_rig().cameras
+STARTED = "2026-11-21T10:00:00Z"
+
+
+def _ball(camera: str, time_s: float, center: tuple[float, float, float] = (0, 0, 1.5)) -> (
+    BallDetection
+):  # fmt: skip
+    return BallDetection(
+        camera, time_s, np.array(center, float), 1e-6 * np.eye(3), 900, 0.1, 1e-4, np.ones((5, 4))
+    )
+
+
+def _rig(day: int) -> Rig:
+    return replace(default_rig(), created=f"2026-11-{day:02d}T10:00:00Z")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> CalibrationStore:
+    return CalibrationStore(tmp_path / "calibrations", tmp_path / "calibration.json")
+
+
+def _finished(store: CalibrationStore, day: int) -> str:
+    session = Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
+    frames = [np.full((480, 640), 20000 + day, np.uint16)] * 2
+    session.keep_empty({"front-lower": static_view(frames, 1e-4)}, [])
+    return store.finish(_rig(day), {"day": day}).name
+
+
+def test_each_calibration_has_its_folder_and_one_is_in_use(store: CalibrationStore) -> None:
+    names = [_finished(store, day) for day in (1, 2)]
+    assert names == ["20261101T100000Z", "20261102T100000Z"]
+    assert not store.unfinished.exists()
+    assert not any(entry.in_use for entry in store.entries())
+    store.use(names[1])
+    assert Rig.load(store.in_use).created == "2026-11-02T10:00:00Z"
+    store.use(names[0])
+    assert Rig.load(store.in_use).created == "2026-11-01T10:00:00Z"
+    assert [entry.in_use for entry in store.entries()] == [True, False]
+    assert json.loads((store.folder / names[1] / "report.json").read_text()) == {"day": 2}
+    assert store.scene()["front-lower"].depth_m()[0, 0] == pytest.approx(2.0001)
+    with pytest.raises(CalibrationError, match=r"no calibration 1999.*20261101T100000Z, 2026"):
+        store.use("1999")
+
+
+def test_a_calibration_of_the_same_second_is_not_overwritten(store: CalibrationStore) -> None:
+    _finished(store, 1)
+    Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
+    with pytest.raises(CalibrationError, match="exists already"):
+        store.finish(_rig(1), {})
+    assert (store.unfinished / "session.json").exists()
+
+
+def test_a_file_from_elsewhere_is_kept_when_another_is_put_into_use(
+    store: CalibrationStore,
+) -> None:
+    """A calibration.json made by hand was once replaced for good."""
+    found = replace(default_rig(), created="2020-01-01T00:00:00Z")
+    found.save(store.in_use)
+    name = _finished(store, 1)
+    store.use(name)
+    store.use(name)
+    kept = [entry for entry in store.entries() if entry.name.startswith("20200101")]
+    assert [entry.name for entry in kept] == ["20200101T000000Z-found"]
+    assert kept[0].rig.created == "2020-01-01T00:00:00Z"
+    store.use("20200101T000000Z-found")
+    assert store.scene() == {}
+
+
+def test_what_was_begun_is_set_aside_not_lost(store: CalibrationStore) -> None:
+    assert store.set_aside() is None
+    for number in (1, 2):
+        Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
+        assert store.set_aside() == store.folder / f"abandoned-{number}"
+    assert store.entries() == []
+
+
+def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
+    session = Session.begin(tmp_path, STARTED, 0.08, CAMERAS)
+    floor = PlaneObservation("front-lower", "floor", 1000, np.ones((3, 4)))
+    view = static_view([np.full((480, 640), 20000, np.uint16)] * 2, 1e-4)
+    session.keep_empty({"front-lower": view}, [floor])
+    session.keep_resting(MARK, [_ball("front-lower", 5.0)])
+    session.begin_run()
+    session.keep_balls([_ball("front-lower", 100.0), _ball("front-upper", 100.01)])
+    session.begin_run()
+    session.keep_balls([_ball("front-lower", 3.0)])
+    session.keep_lenses({"front-upper": Lens([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], [0] * 5)})
+    again = Session.load(tmp_path)
+    assert (again.radius_m, again.started) == (0.08, STARTED)
+    assert again.done(EMPTY)
+    assert again.done(MARK)
+    assert not again.done("front")
+    assert not again.done("wall")
+    observations = again.observations()
+    assert [ball.camera for ball in observations.balls] == [
+        "front-lower", "front-upper", "front-lower",
+    ]  # fmt: skip
+    # Runs have nothing in common, whatever the clocks said.
+    assert observations.balls[2].time_s - observations.balls[1].time_s == pytest.approx(10.0)
+    assert observations.balls[1].time_s - observations.balls[0].time_s == pytest.approx(0.01)
+    assert len(observations.mark) == len(observations.planes) == 1
+    assert again.lensed_cameras()["front-upper"].K[0, 0] == 600.0
+    assert again.lensed_cameras()["front-lower"].K[0, 0] == 585.0
+    assert again.background("front-lower") is not None
+    assert again.background("back-lower") is None
+    again.forget_balls()
+    assert Session.load(tmp_path).balls == []
+
+
+def test_a_line_that_was_cut_off_costs_only_itself(tmp_path: Path) -> None:
+    """kill -9 in the middle of a write."""
+    session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    session.keep_balls([_ball("front-lower", 1.0)])
+    path = tmp_path / JOURNAL
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[: len(whole) // 2])
+    again = Session.load(tmp_path)
+    assert len(again.balls) == 1
+    again.keep_balls([_ball("front-lower", 2.0)])
+    assert [ball.time_s for ball in Session.load(tmp_path).balls] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "line", ["{}", "[1]", "no json", '{"step": "ball", "balls": [{"camera": "a"}]}']
+)
+def test_a_line_that_is_not_ours_is_named(tmp_path: Path, line: str) -> None:
+    session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    session.keep_balls([_ball("front-lower", 1.0)])
+    path = tmp_path / JOURNAL
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(FormatError, match=r"observations\.jsonl: line 2"):
+        Session.load(tmp_path)
+
+
+def test_another_version_is_refused(tmp_path: Path) -> None:
+    Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    path = tmp_path / "session.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 7}))
+    with pytest.raises(FormatError, match="version 7; this program reads 1"):
+        Session.load(tmp_path)
+
+
+def test_other_cameras_are_not_mixed_in(tmp_path: Path) -> None:
+    session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    session.check_cameras(CAMERAS)
+    changed = replace(CAMERAS["back-lower"], serial="X")
+    with pytest.raises(CalibrationError, match="camera back-lower is X now and was V00000003"):
+        session.check_cameras({**CAMERAS, "back-lower": changed})
+    fewer = {name: camera for name, camera in CAMERAS.items() if name != "back-upper"}
+    with pytest.raises(CalibrationError, match="camera back-upper is not configured now"):
+        session.check_cameras(fewer)
+    assert (tmp_path / SENSORS).exists()
+
+
+def test_advice_names_what_is_missing() -> None:
+    coverage = Coverage(CAMERAS, "front-upper")
+    assert coverage.share == 0.0
+    assert "0 of 120" in coverage.advice()
+    rng = np.random.default_rng(0)
+    for moment in range(400):
+        for name in ("front-upper", "front-lower"):
+            x, y, z = rng.uniform((-0.5, -0.4, 1.2), (0.5, 0.4, 2.2))
+            coverage.add(
+                _ball(name, 0.1 * moment + (0.02 if name == "front-lower" else 0), (x, y, z))
+            )
+    assert coverage.ties()["front-lower"] == ("front-upper", 400)
+    assert coverage.ties()["back-lower"][1] == 0
+    assert not coverage.enough
+    for moment in range(400, 800):
+        for index, name in enumerate(CAMERAS):
+            x, y, z = rng.uniform((-0.5, -0.4, 1.2), (0.5, 0.4, 2.2))
+            coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (x, y, z)))
+    assert coverage.enough
+    assert coverage.share == 1.0
+    assert coverage.advice() == "everything is covered"
+
+
+def test_one_corner_of_the_image_is_not_enough() -> None:
+    coverage = Coverage(CAMERAS, "front-upper")
+    for moment in range(400):
+        for index, name in enumerate(CAMERAS):
+            coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (-0.3, -0.3, 1.5)))
+    assert not coverage.enough
+    assert "misses it" in coverage.advice() or "nearer" in coverage.advice()

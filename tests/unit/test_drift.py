@@ -1,0 +1,135 @@
+"""The background tells whether a camera moved; people and bare walls must not mislead it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from station.calibration.drift import LEVER_M, DriftReference, estimate_move
+from station.calibration.scene import StaticView, static_view
+from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
+from station.drivers.virtual_noise import TrueView, UnitError, observe
+from station.drivers.virtual_scene import (
+    Mesh,
+    VirtualScene,
+    booth_walls,
+    box,
+    default_rig,
+    fixed_posts,
+    load_mesh,
+)
+from station.errors import FormatError
+from station.geometry import se3_exp
+
+CAMERA = default_rig().cameras["front-lower"]
+ROOM = (*booth_walls(), *fixed_posts())
+BODY = load_mesh(Path(__file__).parents[2] / "station/data/bodies/ben.npz")
+UNIT = UnitError(0.008, (0.2, -0.1))
+Twist = tuple[float, float, float, float, float, float]
+STILL: Twist = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _view(meshes: tuple[Mesh, ...], xi: Twist = STILL) -> TrueView:
+    return VirtualScene(meshes).view(CAMERA, CAMERA.world_from_camera @ se3_exp(xi))
+
+
+def _frames(view: TrueView, count: int, seed: int) -> list[NDArray[np.uint16]]:
+    rng = np.random.default_rng(seed)
+    return [TABLE[observe(view, UNIT, rng)] for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def stored() -> StaticView:
+    return static_view(_frames(_view(ROOM), 30, seed=1), DEPTH_SCALE_M)
+
+
+@pytest.fixture(scope="module")
+def reference(stored: StaticView) -> DriftReference:
+    return DriftReference.prepare(CAMERA, stored)
+
+
+@pytest.mark.parametrize("meshes", [ROOM, (*ROOM, BODY)], ids=["empty", "person"])
+def test_a_camera_that_stands_still_is_left_alone(
+    reference: DriftReference, meshes: tuple[Mesh, ...]
+) -> None:
+    move = estimate_move(reference, _frames(_view(meshes), 10, seed=2), DEPTH_SCALE_M)
+    assert not move.moved
+    assert not move.lost
+    assert move.alarm() < 0.9
+    assert move.xi @ np.linalg.solve(move.covariance, move.xi) < 30.0
+    assert "stands where" in move.words()
+
+
+@pytest.mark.parametrize(
+    "xi",
+    [
+        (0.0, 0.0, 0.0, 0.005, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 0.005, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 0.0, -0.005),
+        (0.00524, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.00524, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, -0.00524, 0.0, 0.0, 0.0),
+    ],
+)
+def test_five_millimetres_or_a_third_of_a_degree_are_named(
+    reference: DriftReference, xi: Twist
+) -> None:
+    view = _view((*ROOM, BODY), xi)
+    move = estimate_move(reference, _frames(view, 10, seed=3), DEPTH_SCALE_M)
+    assert move.moved
+    assert "camera front-lower has moved" in move.words()
+    scale = np.array([LEVER_M] * 3 + [1.0] * 3)
+    assert np.abs((move.xi - xi) * scale).max() < 0.0025
+
+
+def test_a_hard_knock_is_measured(reference: DriftReference) -> None:
+    """Outlines see only a few pixels far: the surfaces have to bring them there."""
+    xi = (0.015, -0.02, 0.01, 0.03, -0.01, 0.02)
+    move = estimate_move(reference, _frames(_view(ROOM, xi), 10, seed=4), DEPTH_SCALE_M)
+    assert move.moved
+    assert np.allclose(move.xi[:3], xi[:3], atol=0.003)
+    assert np.allclose(move.xi[3:], xi[3:], atol=0.006)
+
+
+def test_a_covered_or_turned_camera_is_lost(reference: DriftReference) -> None:
+    covered = estimate_move(reference, [np.full((480, 640), 8000, np.uint16)] * 3, DEPTH_SCALE_M)
+    assert covered.lost
+    assert "no longer sees" in covered.words()
+    turned = _view(ROOM, (0.0, 0.6, 0.0, 0.0, 0.0, 0.0))
+    move = estimate_move(reference, _frames(turned, 5, seed=5), DEPTH_SCALE_M)
+    assert move.lost or move.moved
+
+
+def test_a_bare_wall_says_nothing_of_moves_along_it() -> None:
+    """Noise in the wall's slope once passed for structure: a shift along it was called certain."""
+    wall = (box((-6.0, 1.0, -4.0), (6.0, 1.1, 6.0)),)
+    bare = DriftReference.prepare(
+        CAMERA, static_view(_frames(_view(wall), 20, seed=6), DEPTH_SCALE_M)
+    )
+    along = _view(wall, (0.0, 0.0, 0.0, 0.01, 0.0, 0.0))
+    move = estimate_move(bare, _frames(along, 10, seed=7), DEPTH_SCALE_M)
+    assert len(move.unseen()) == 3
+    assert {"sideways", "up or down", "tilting"} == set(move.unseen_words())
+    nearer = _view(wall, (0.0, 0.0, 0.0, 0.0, 0.0, 0.005))
+    assert estimate_move(bare, _frames(nearer, 10, seed=8), DEPTH_SCALE_M).moved
+
+
+def test_a_stored_view_comes_back(stored: StaticView, tmp_path: Path) -> None:
+    path = tmp_path / "front-lower.npz"
+    stored.save(path)
+    found = StaticView.load(path)
+    assert np.array_equal(found.inverse_depth, stored.inverse_depth)
+    # Shares once came back in steps of 1/255: the wall stood 2 mm nearer, and cameras "moved".
+    assert np.allclose(found.share, stored.share, rtol=0.0, atol=1e-6)
+    assert np.allclose(found.noise, stored.noise, rtol=1e-3, atol=1e-6)
+    assert found.frames == 30
+    depth = found.depth_m()
+    assert 1.0 < np.median(depth[depth > 0]) < 4.5
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(FormatError, match=r"front-lower\.npz cannot be read"):
+        StaticView.load(path)
+    with pytest.raises(FormatError, match=r"nothing\.npz"):
+        StaticView.load(tmp_path / "nothing.npz")

@@ -1,0 +1,104 @@
+"""Frames for a calibration: the times of replayed recordings are those of the day."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.calibration.feed import RecordedClock, gather_frames, replayed_feed
+from station.config import BoothConfig, CameraConfig
+from station.errors import CalibrationError, FormatError
+from station.messages import FrameHeader
+from station.recording import RecordedFrame, write_recording
+
+_HZ = 60_000_000
+_FIRST_TICK = 2**32 - 4 * 2_000_000
+"""The counter wraps after four frames."""
+
+
+def _record(folder: Path, count: int = 12, start_s: float = 100.0) -> None:
+    frames = [
+        RecordedFrame(
+            start_s + index / 30.0,
+            (_FIRST_TICK + index * 2_000_000) % 2**32,
+            np.full((480, 640), 600 + index, np.uint16),
+        )
+        for index in range(count)
+    ]
+    write_recording(folder, frames, tick_hz=_HZ)
+
+
+def _header(ticks: int) -> FrameHeader:
+    return FrameHeader("front", "A", 640, 480, 1e-4, ticks, _HZ, 5.0, 5.0, 1)
+
+
+def test_a_replays_times_are_those_of_its_recording(tmp_path: Path) -> None:
+    """Replays start one after the other and keep pace badly: the ball was decimetres apart."""
+    _record(tmp_path / "a")
+    clock = RecordedClock(tmp_path / "a")
+    order = [0, 1, 4, 5, 9, 11]
+    times = [clock.time_s(_header((_FIRST_TICK + i * 2_000_000) % 2**32)) for i in order]
+    assert np.allclose(np.array(times, float), [100.0 + i / 30.0 for i in order], atol=1e-5)
+    assert clock.over
+    assert clock.time_s(_header(_FIRST_TICK)) is None
+
+
+def test_a_replay_that_starts_over_without_its_last_frame_is_over(tmp_path: Path) -> None:
+    _record(tmp_path / "a")
+    clock = RecordedClock(tmp_path / "a")
+    assert clock.time_s(_header(_FIRST_TICK + 2_000_000)) is not None
+    assert clock.time_s(_header(_FIRST_TICK)) is None
+    assert clock.over
+
+
+def test_a_frame_of_another_recording_is_refused(tmp_path: Path) -> None:
+    _record(tmp_path / "a")
+    with pytest.raises(CalibrationError, match="camera front shows a frame"):
+        RecordedClock(tmp_path / "a").time_s(_header(17))
+
+
+def _config(*names: str) -> BoothConfig:
+    cameras = tuple(
+        CameraConfig(name=name, driver="recorded", recording=Path("elsewhere")) for name in names
+    )
+    return BoothConfig(cameras=cameras)
+
+
+def test_recordings_are_replayed_through_capture_processes(tmp_path: Path) -> None:
+    for name in ("front", "back"):
+        _record(tmp_path / name, 30)
+    with replayed_feed(_config("front", "back"), tmp_path) as feed:
+        cameras = feed.cameras(20.0)
+        taken = gather_frames(feed, cameras, 10, lambda _: None)
+    assert cameras["front"].K[0, 0] == 585.0
+    assert cameras["front"].model == "kinect-v1"
+    for frames in taken.values():
+        assert len(frames) == 10
+        times = np.array([frame.time_s for frame in frames])
+        assert (np.diff(times) > 0.03).all()
+        assert 100.0 <= times[0] < 101.0
+        values = [frame.depth_m()[0, 0] for frame in frames]
+        assert (np.diff(values) > 0).all()
+
+
+def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+    _record(tmp_path / "front")
+    with (
+        pytest.raises(FormatError, match="back"),
+        replayed_feed(_config("front", "back"), tmp_path),
+    ):
+        pass
+
+
+def test_a_station_that_does_not_run_is_said(tmp_path: Path) -> None:
+    from station.calibration.feed import live_feed
+    from station.config import RuntimeConfig
+    from station.errors import BoothError
+
+    config = _config("front").model_copy(
+        update={"runtime": RuntimeConfig(folder=tmp_path, command_timeout_s=0.3)}
+    )
+    with live_feed(config) as feed, pytest.raises(BoothError, match="station run"):
+        feed.cameras(1.0)
