@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -258,6 +259,7 @@ class _Equations:
         self._path_pull = np.zeros(3 * count)
         self.deviations: dict[str, Array] = {}
         self._cost, self._seen = 0.0, 0.0
+        self._path_share = np.zeros(count)
         self._smooth(state)
         self._priors(problem, layout, state)
         for name, seen in problem.waved.items():
@@ -315,7 +317,6 @@ class _Equations:
                 clock = layout.camera(name)[6]
                 self._border[clock, clock] += CLOCK_TOLERANCE_S**-2.0
                 self._border_pull[clock] += state.clock_s[name] / CLOCK_TOLERANCE_S**2
-        self._path_share = np.zeros(state.grid.count)
 
     def _add_waved(
         self, name: str, seen: Sightings, problem: Problem, layout: Layout, state: State
@@ -423,8 +424,6 @@ def _robust_weight(deviation: Array) -> Array:
 
 def _rays(camera: CameraCalibration, patches: Array) -> Array:
     """(..., 2): x, y of the rays (x, y, 1) through the patches' middles, the lens undone."""
-    import cv2
-
     if not camera.distortion.any():
         K = camera.K
         return np.asarray((patches[..., :2] - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1]))

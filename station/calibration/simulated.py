@@ -17,9 +17,12 @@ from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import TICK_HZ
 from station.drivers.virtual_calibration import BALL, EMPTY, FRONT, MARK, VirtualProcedure
 
+_Depth = NDArray[np.float32]
+
 _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
 _LOOK_S = 1.0
+"""At the ball on the floor."""
 
 
 def simulate(
@@ -61,6 +64,3 @@ def simulate(
         if step.startswith("wall-"):
             planes.append(observe_wall(still(step), DEPTH_SCALE_M, camera, step, background))
     return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
-
-
-_Depth = NDArray[np.float32]
