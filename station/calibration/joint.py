@@ -29,6 +29,8 @@ _ITERATIONS = 12
 _SMALL_STEP = 2e-6
 CLOCK_TOLERANCE_S = 0.005
 """Standard deviation of one camera's clock against another's, before it is solved for."""
+_TAIL = 4.0
+"""Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
@@ -308,9 +310,11 @@ class _Equations:
         self._band[11] += 1e-6 * weight
 
     def _priors(self, problem: Problem, layout: Layout, state: State) -> None:
-        information = depth_correction.TOLERANCE**-2.0
         for name in problem.cameras:
             index = layout.correction(name)
+            # Heavy tails: a sensor that the data say is far off is believed to be.
+            off = state.corrections[name] / depth_correction.TOLERANCE
+            information = depth_correction.TOLERANCE**-2.0 * _TAIL / (_TAIL + off**2)
             self._border[index, index] += information
             self._border_pull[index] += information * state.corrections[name]
             if name != layout.reference:
