@@ -67,7 +67,7 @@ class TimeGrid:
             np.add.at(right, first + i, (weights * value[:, i])[:, None] * points)
             for j in range(i, 4):
                 np.add.at(band[3 - (j - i)], first + j, weights * value[:, i] * value[:, j])
-        band[3] += 1e-6 * band[3].max()
+        band[3] += 1e-6 * self.smoothness()[2, 0]
         return np.asarray(cho_solve_banded((cholesky_banded(band), False), right))
 
 

@@ -22,12 +22,12 @@ from workers.scape.model import BodyModel
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MOST_ROUNDS = 30
+_MOST_ROUNDS = 45
 _STUBBORN_ROUNDS = 3
 """Rounds after which a place no longer counts on the model's own shape."""
 _ROUNDS_A_RING = 4
 _SWEEPS = 8
-_FLATTENING = 0.5
+_FLATTENING = 0.75
 """Share of the way to the neighbours' mean that a stubborn vertex goes in one round."""
 
 

@@ -21,13 +21,22 @@ _REPEATS = 15
 
 
 @dataclass(frozen=True, slots=True)
-class Resources:
-    """Seconds and bytes in a process of its own."""
+class Span:
+    """How long something took: by the clock, and of this process' processor time (a busy machine
+    shows in the difference)."""
 
-    load_s: float
+    wall_s: float
+    processor_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """What the model takes in a process of its own."""
+
+    load: Span
     """Of the file and of everything that is derived from it."""
-    body_s: float
-    jacobian_s: float
+    body: Span
+    jacobian: Span
     peak_bytes: int
 
 
@@ -45,25 +54,26 @@ def _in_child(path: Path | None, folder: str) -> Resources:
 
 def _measured(path: Path | None, folder: str) -> Resources:
     os.environ[FOLDER_VARIABLE] = folder
-    start_s = time.perf_counter()
+    start = time.perf_counter(), time.process_time()
     model = load_model(path)
     samples = model.at(np.linspace(0, model.vertex_count - 1, SAMPLES).astype(np.int64))
     state = model.neutral_state()
     model.vertices(state)
-    load_s = time.perf_counter() - start_s
-    body_s = _median_s(lambda: model.vertices(state))
-    jacobian_s = _median_s(lambda: samples.jacobian(state))
-    return Resources(load_s, body_s, jacobian_s, _peak_bytes())
+    load = Span(time.perf_counter() - start[0], time.process_time() - start[1])
+    body = _median_span(lambda: model.vertices(state))
+    jacobian = _median_span(lambda: samples.jacobian(state))
+    return Resources(load, body, jacobian, _peak_bytes())
 
 
-def _median_s(call: Callable[[], object]) -> float:
+def _median_span(call: Callable[[], object]) -> Span:
     call()
-    times = []
+    spans = []
     for _ in range(_REPEATS):
-        start_s = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         call()
-        times.append(time.perf_counter() - start_s)
-    return float(np.median(times))
+        spans.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    wall_s, processor_s = np.median(spans, axis=0)
+    return Span(float(wall_s), float(processor_s))
 
 
 def _peak_bytes() -> int:

@@ -1,0 +1,152 @@
+"""The solution on detections drawn from the sensor's own noise: poses, honesty, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic_calibration as synthetic
+
+from station.calibration.detections import Observations
+from station.calibration.rig import Rig
+from station.calibration.solve import Solution, solve
+from station.calibration.world import relatives, twist_between
+from station.drivers.virtual import SimulatedUnit
+from station.drivers.virtual_calibration import VirtualProcedure
+from station.errors import CalibrationError
+from station.geometry import invert
+
+REFERENCE, FRONT = "front-upper", ("front-upper", "front-lower")
+
+
+def solved(rig: Rig, seen: Observations, radius_m: float = 0.1, **changes: object) -> Solution:
+    options: dict[str, object] = {"reference": REFERENCE, "front_cameras": FRONT, **changes}
+    cameras = synthetic.factory(rig)
+    created = "2026-01-01T00:00:00Z"
+    return solve(seen, cameras, radius_m=radius_m, created=created, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def procedure() -> VirtualProcedure:
+    return VirtualProcedure(synthetic.booth(101))
+
+
+@pytest.fixture(scope="module")
+def seen(procedure: VirtualProcedure) -> Observations:
+    return synthetic.observations(procedure, clock_error_s=0.002)
+
+
+@pytest.fixture(scope="module")
+def solution(procedure: VirtualProcedure, seen: Observations) -> Solution:
+    return solved(procedure.booth.rig, seen)
+
+
+def errors(rig: Rig, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """Twists (18,) of three cameras relative to the reference, and their covariance."""
+    others = [name for name in rig.cameras if name != REFERENCE]
+    found, covariance = relatives(solution.placed, REFERENCE, others)
+    base = invert(rig.cameras[REFERENCE].world_from_camera)
+    twists = [
+        twist_between(pose, base @ rig.cameras[name].world_from_camera)
+        for name, pose in zip(others, found, strict=True)
+    ]
+    return np.concatenate(twists), covariance
+
+
+def test_front_and_back_are_tied_to_a_millimetre(
+    procedure: VirtualProcedure, solution: Solution
+) -> None:
+    twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
+    assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
+    assert np.degrees(np.linalg.norm(twists[:, :3], axis=1)).max() < 0.1
+
+
+def test_what_it_says_of_its_own_errors_is_true() -> None:
+    """Noise that entered both sides of an equation once biased the depth scale by 4 sigma."""
+    total, unknowns = 0.0, 0
+    for seed in (111, 112, 113, 114):
+        procedure = VirtualProcedure(synthetic.booth(seed), waving_s=40.0)
+        rig = procedure.booth.rig
+        away, covariance = errors(rig, solved(rig, synthetic.observations(procedure)))
+        total += float(away @ np.linalg.solve(covariance, away))
+        unknowns += len(away)
+    # 72 unknowns: 99.9 % lie between 0.55 and 1.6 a piece.
+    assert 0.55 < total / unknowns < 1.6
+
+
+def test_depth_errors_are_found(procedure: VirtualProcedure, solution: Solution) -> None:
+    """A shift of the disparity that tilts over the image, up to 15 mm at 2 m."""
+    for name, camera in solution.rig.cameras.items():
+        error = SimulatedUnit.of(procedure.booth, name).error
+        y, x = np.mgrid[40:440:100, 40:600:140]
+        for depth in (1.3, 1.7, 2.1):
+            image = np.full((480, 640), depth, np.float32)
+            corrected = camera.depth_correction.apply(error.apply(image))
+            left = np.abs(corrected - depth)[y, x]
+            before = np.abs(error.apply(image) - depth)[y, x]
+            assert left.mean() < max(0.25 * before.mean(), 1.6e-3)
+
+
+def test_the_mark_is_the_origin_and_the_floor_is_zero(
+    procedure: VirtualProcedure, solution: Solution
+) -> None:
+    for name, camera in procedure.booth.rig.cameras.items():
+        pose = solution.rig.cameras[name].world_from_camera
+        assert np.linalg.norm(pose[:3, 3] - camera.world_from_camera[:3, 3]) < 6e-3
+    assert solution.placed.mark_height_m == pytest.approx(0.1, abs=2e-3)
+
+
+def test_the_heading_comes_from_the_front_cameras_without_a_second_place(
+    procedure: VirtualProcedure, seen: Observations
+) -> None:
+    rig = solved(procedure.booth.rig, replace(seen, front=())).rig
+    middle = np.mean([rig.cameras[name].world_from_camera[:3, 3] for name in FRONT], axis=0)
+    assert abs(middle[0]) < 1e-6
+    assert middle[1] < -1.0
+
+
+def test_clock_offsets_are_found(procedure: VirtualProcedure, solution: Solution) -> None:
+    late = {
+        name: 0.002 * np.random.default_rng((101, index, 9)).standard_normal()
+        for index, name in enumerate(procedure.booth.rig.cameras)
+    }
+    for name, offset in solution.clock_s.items():
+        assert offset == pytest.approx(late[REFERENCE] - late[name], abs=5e-4)
+
+
+def test_it_can_be_reported_and_read_again(
+    solution: Solution, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("rig") / "calibration.json"
+    solution.rig.save(path)
+    found = Rig.load(path)
+    for name, camera in solution.rig.cameras.items():
+        assert found.cameras[name].depth_correction == camera.depth_correction
+        assert camera.covariance is not None
+        assert np.linalg.eigvalsh(camera.covariance).min() > 0
+    assert len(solution.summary()) >= 5
+    assert set(solution.report["cameras"]) == set(solution.rig.cameras)
+    assert 1e-4 < solution.rig.residual_rms_m < 4e-3
+
+
+@pytest.mark.parametrize("fault", synthetic.FAULTS, ids=lambda fault: fault.name)
+def test_what_spoils_it_is_refused_in_words(
+    procedure: VirtualProcedure, seen: Observations, fault: synthetic.Fault
+) -> None:
+    with pytest.raises(CalibrationError) as raised:
+        solved(procedure.booth.rig, fault.spoil(seen), fault.radius_m)
+    assert fault.words in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observations) -> None:
+    """The head of whoever waves the ball is found in its stead now and then."""
+    rng = np.random.default_rng(3)
+    heads = [
+        replace(ball, center_m=ball.center_m + rng.normal(0, 0.3, 3), radius_m=0.1)
+        if rng.random() < 0.1
+        else ball
+        for ball in seen.balls
+    ]
+    solution = solved(procedure.booth.rig, replace(seen, balls=heads))
+    twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
+    assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
