@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from station.calibration import depth_correction
-from station.calibration.detections import BallDetection, PlaneObservation
+from station.calibration.detections import FLOOR, BallDetection, PlaneObservation
 from station.calibration.rig import CameraCalibration
 from station.calibration.trajectory import TimeGrid, along
 from station.geometry import se3_exp, skew
@@ -29,6 +29,8 @@ _ITERATIONS = 12
 _SMALL_STEP = 2e-6
 CLOCK_TOLERANCE_S = 0.005
 """Standard deviation of one camera's clock against another's, before it is solved for."""
+CONTACT_M = 0.0005
+"""How evenly a ball rests on a floor."""
 _TAIL = 4.0
 """Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
 _GATE = 11.3
@@ -271,6 +273,9 @@ class _Equations:
                 self._add_resting(place, seen, problem, layout, state)
         for surface in problem.surfaces:
             self._add_surface(surface, layout, state)
+        if FLOOR in state.planes:
+            for place in problem.resting:
+                self._add_contact(place, problem.radius_m, layout, state)
 
     def solve(self) -> tuple[Array, Array]:
         """Steps of the border (m,) and of the path (count, 3)."""
@@ -401,6 +406,19 @@ class _Equations:
         )
         index = np.concatenate([layout.camera(surface.camera), layout.triple(surface.surface)])
         self._add_border(index, chain, surface.normal, surface.pull + surface.normal @ at)
+
+    def _add_contact(self, place: str, radius_m: float, layout: Layout, state: State) -> None:
+        """The ball rests on the floor: its centre is a radius above the plane q . X = 1."""
+        at, q = state.places[place], state.planes[FLOOR]
+        length = np.linalg.norm(q)
+        above = (1.0 - q @ at) / length
+        row = np.concatenate([-q / length, -at / length - above * q / length**2])
+        index = np.concatenate([layout.triple(place), layout.triple(FLOOR)])
+        # A ball that lies on something else is refused later: it must not tilt the floor.
+        off = (above - radius_m) / CONTACT_M
+        weight = CONTACT_M**-2.0 * _TAIL / (_TAIL + off**2)
+        self._border[np.ix_(index, index)] += weight * np.outer(row, row)
+        self._border_pull[index] += weight * (above - radius_m) * row
 
     def _add_border(self, index: Indices, chain: Array, normal: Array, pull: Array) -> None:
         kept = index >= 0
