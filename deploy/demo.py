@@ -22,7 +22,7 @@ from station.geometry import invert, so3_log
 
 BODY = Path(__file__).parents[1] / "station/data/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
-WAVING_S = 20
+WAVING_S = 24
 
 
 def main() -> int:

@@ -78,7 +78,9 @@ def find_ball(
     inverse = _inverse(depth_m)
     foreground = inverse > 0.0
     if background_m is not None:
-        foreground &= inverse > _inverse(background_m) + _FOREGROUND
+        # 1/z > 1/b + f, where there is a background b at all.
+        nearest = background_m / (1.0 + _FOREGROUND * background_m)
+        foreground &= (depth_m < nearest) | (background_m == 0.0)
     best: _Fit | None = None
     for start in _candidates(inverse, foreground, camera, radius_m):
         fit = _fit(inverse, camera, start, radius_m)
@@ -102,7 +104,9 @@ def find_ball(
 
 def _inverse(depth_m: Image) -> Image:
     usable = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
-    return np.where(usable, 1.0 / np.where(usable, depth_m, 1.0), 0.0).astype(np.float32)
+    inverse = np.zeros(depth_m.shape, np.float32)
+    np.divide(np.float32(1.0), depth_m, out=inverse, where=usable, casting="same_kind")
+    return inverse
 
 
 def _candidates(
@@ -205,7 +209,7 @@ class _Fit:
 def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: float) -> _Fit | None:
     """The most likely ball near a place, if the pixels say that one is there."""
     center, radius = start.copy(), radius_m
-    gate = _START_GATE_M * 1.0 / max(start[2], 0.3) ** 2
+    gate = _START_GATE_M / max(start[2], 0.3) ** 2
     window = _window(camera, center, 1.3 * radius_m)
     if window is None:
         return None

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from station.calibration import depth_correction
-from station.calibration.detections import BallDetection, PlaneObservation
+from station.calibration.detections import FLOOR, BallDetection, PlaneObservation
 from station.calibration.rig import CameraCalibration
 from station.calibration.trajectory import TimeGrid, along
 from station.geometry import se3_exp, skew
@@ -28,6 +29,10 @@ _ITERATIONS = 12
 _SMALL_STEP = 2e-6
 CLOCK_TOLERANCE_S = 0.005
 """Standard deviation of one camera's clock against another's, before it is solved for."""
+CONTACT_M = 0.0005
+"""How evenly a ball rests on a floor."""
+_TAIL = 4.0
+"""Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
@@ -258,6 +263,7 @@ class _Equations:
         self._path_pull = np.zeros(3 * count)
         self.deviations: dict[str, Array] = {}
         self._cost, self._seen = 0.0, 0.0
+        self._path_share = np.zeros(count)
         self._smooth(state)
         self._priors(problem, layout, state)
         for name, seen in problem.waved.items():
@@ -267,6 +273,9 @@ class _Equations:
                 self._add_resting(place, seen, problem, layout, state)
         for surface in problem.surfaces:
             self._add_surface(surface, layout, state)
+        if FLOOR in state.planes:
+            for place in problem.resting:
+                self._add_contact(place, problem.radius_m, layout, state)
 
     def solve(self) -> tuple[Array, Array]:
         """Steps of the border (m,) and of the path (count, 3)."""
@@ -306,16 +315,17 @@ class _Equations:
         self._band[11] += 1e-6 * weight
 
     def _priors(self, problem: Problem, layout: Layout, state: State) -> None:
-        information = depth_correction.TOLERANCE**-2.0
         for name in problem.cameras:
             index = layout.correction(name)
+            # Heavy tails: a sensor that the data say is far off is believed to be.
+            off = state.corrections[name] / depth_correction.TOLERANCE
+            information = depth_correction.TOLERANCE**-2.0 * _TAIL / (_TAIL + off**2)
             self._border[index, index] += information
             self._border_pull[index] += information * state.corrections[name]
             if name != layout.reference:
                 clock = layout.camera(name)[6]
                 self._border[clock, clock] += CLOCK_TOLERANCE_S**-2.0
                 self._border_pull[clock] += state.clock_s[name] / CLOCK_TOLERANCE_S**2
-        self._path_share = np.zeros(state.grid.count)
 
     def _add_waved(
         self, name: str, seen: Sightings, problem: Problem, layout: Layout, state: State
@@ -397,6 +407,19 @@ class _Equations:
         index = np.concatenate([layout.camera(surface.camera), layout.triple(surface.surface)])
         self._add_border(index, chain, surface.normal, surface.pull + surface.normal @ at)
 
+    def _add_contact(self, place: str, radius_m: float, layout: Layout, state: State) -> None:
+        """The ball rests on the floor: its centre is a radius above the plane q . X = 1."""
+        at, q = state.places[place], state.planes[FLOOR]
+        length = np.linalg.norm(q)
+        above = (1.0 - q @ at) / length
+        row = np.concatenate([-q / length, -at / length - above * q / length**2])
+        index = np.concatenate([layout.triple(place), layout.triple(FLOOR)])
+        # A ball that lies on something else is refused later: it must not tilt the floor.
+        off = (above - radius_m) / CONTACT_M
+        weight = CONTACT_M**-2.0 * _TAIL / (_TAIL + off**2)
+        self._border[np.ix_(index, index)] += weight * np.outer(row, row)
+        self._border_pull[index] += weight * (above - radius_m) * row
+
     def _add_border(self, index: Indices, chain: Array, normal: Array, pull: Array) -> None:
         kept = index >= 0
         chain, index = chain[:, kept], index[kept]
@@ -423,8 +446,6 @@ def _robust_weight(deviation: Array) -> Array:
 
 def _rays(camera: CameraCalibration, patches: Array) -> Array:
     """(..., 2): x, y of the rays (x, y, 1) through the patches' middles, the lens undone."""
-    import cv2
-
     if not camera.distortion.any():
         K = camera.K
         return np.asarray((patches[..., :2] - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1]))

@@ -17,9 +17,12 @@ from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import TICK_HZ
 from station.drivers.virtual_calibration import BALL, EMPTY, FRONT, MARK, VirtualProcedure
 
+_Depth = NDArray[np.float32]
+
 _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
 _LOOK_S = 1.0
+"""At the ball on the floor, and at the board."""
 
 
 def simulate(
@@ -37,11 +40,11 @@ def simulate(
             time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)
             yield time_s, (TABLE[frame.raw] * np.float32(DEPTH_SCALE_M)).astype(np.float32)
 
-    def still(step: str) -> NDArray[np.uint16]:
-        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, None, 1)])
+    def still(step: str, limit_s: float | None) -> NDArray[np.uint16]:
+        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, limit_s, 1)])
         return stack.astype(np.uint16)
 
-    empty = still(EMPTY)
+    empty = still(EMPTY, None)
     background = average(empty, DEPTH_SCALE_M).depth_m
 
     def balls(step: str, limit_s: float | None, every: int) -> list[BallDetection]:
@@ -59,8 +62,7 @@ def simulate(
     )
     for step in procedure.steps:
         if step.startswith("wall-"):
-            planes.append(observe_wall(still(step), DEPTH_SCALE_M, camera, step, background))
+            planes.append(
+                observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
+            )
     return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
-
-
-_Depth = NDArray[np.float32]

@@ -17,7 +17,7 @@ from station.calibration.scene import Image, smoothed, static_view
 from station.calibration.session import Session
 from station.errors import CalibrationError
 
-_EMPTY_FRAMES = 45
+_EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
 _RESTING_DETECTIONS = 12

@@ -133,10 +133,8 @@ def _cylinder(booth: SimulatedBooth, rig: Rig, folder: Path) -> float:
     """Rms distance of merged points from a cylinder on the mark, mm."""
     radius, height = _CYLINDER_M
     shape = o3d.geometry.TriangleMesh.create_cylinder(radius, height, 360, 1)
-    mesh = Mesh(
-        (*np.asarray(shape.vertices), 0.0, 0.0, height / 2 + 0.05),
-        np.asarray(shape.triangles, np.int32),
-    )
+    up = np.array([0.0, 0.0, height / 2 + 0.05])
+    mesh = Mesh(np.asarray(shape.vertices) + up, np.asarray(shape.triangles, np.int32))
     points = _cloud(booth, rig, mesh, folder)
     side = points[(points[:, 2] > 0.2) & (points[:, 2] < height - 0.1)]
     return 1e3 * float(np.sqrt(np.mean((np.hypot(side[:, 0], side[:, 1]) - radius) ** 2)))

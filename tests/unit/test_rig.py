@@ -1,5 +1,6 @@
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,19 @@ def test_depth_correction_acts_on_inverse_depth() -> None:
     assert np.allclose(1.0 / corrected[1:], 0.01 + 1.02 / depth[1:], rtol=1e-6)
     assert corrected.dtype == np.float32
     assert DepthCorrection().apply(depth) is depth
+
+
+def test_a_gradient_over_the_image_goes_from_edge_to_edge(tmp_path: Path) -> None:
+    correction = DepthCorrection((0.01, 1.0), (0.02, -0.03))
+    corrected = correction.apply(np.full((3, 5), 2.0))
+    expected = 0.51 + 0.02 * np.linspace(-1, 1, 5) - 0.03 * np.linspace(-1, 1, 3)[:, None]
+    assert np.allclose(1.0 / corrected, expected)
+    assert not DepthCorrection((-1.0, 1.0)).apply(np.full(4, 2.0)).any()
+    rig = make_rig()
+    camera = replace(rig.cameras["front-upper"], depth_correction=correction)
+    path = tmp_path / "calibration.json"
+    replace(rig, cameras={camera.name: camera}).save(path)
+    assert Rig.load(path).cameras[camera.name].depth_correction == correction
 
 
 def _set(*keys: str, value: Any) -> Callable[[dict[str, Any]], None]:
