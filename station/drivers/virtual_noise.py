@@ -1,10 +1,10 @@
 """What a structured-light Kinect v1 does to a true depth image.
 
-Geometry and figures: baseline 75 mm, disparity steps of 1/8 px, random error, silhouette pixels that
-flicker and fly after Nguyen, Izadi & Lovell 2012 (what reads the images assumes the other law that
-is published, Khoshelham & Elberink's: the sensor is not its own judge), errors correlated over the
-matching window of about 9 x 9 px, no reading beyond 70-75 degrees of incidence or in the projector's
-shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
+Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
+and fly: Nguyen, Izadi & Lovell 2012. (What reads the images assumes the other published law, that
+of Khoshelham & Elberink: it shall not be judged by its own assumption.) Errors are correlated over
+the matching window of about 9 x 9 px; there is no reading beyond 70-75 degrees of incidence or in
+the projector's shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
 """
 
 from __future__ import annotations
