@@ -28,7 +28,8 @@ _MAX_INCIDENCE_COSINE = np.cos(np.radians(76.0))
 _VOXEL_M = 0.04
 _LEAST_POINTS = 2000
 _SECOND_PERSON_SHARE = 0.15
-_SECOND_PERSON_HEIGHT_M = 0.7
+_SECOND_PERSON_HEIGHT_M = 1.1
+"""A chair that stands apart harms nothing; another adult is another scan."""
 _PEOPLE_STRIDE = 4
 _MOTION_M = 0.010
 _UNSETTLED_SHARE = 0.25
@@ -83,6 +84,8 @@ class PointCloud:
     camera: NDArray[np.int16]
     """(n,): index into camera_names."""
     camera_names: tuple[str, ...]
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the origin of a bare cloud's points was in its own frame, turned z up."""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -159,7 +159,7 @@ def bad_clouds(body: Mesh) -> Iterator[tuple[str, PointCloud]]:
     holed = good.points.copy()
     holed[1000] = np.nan
     rng = np.random.default_rng(1)
-    fog = rng.uniform((-0.4, -0.3, 0.0), (0.4, 0.3, 1.8), (50_000, 3))
+    fog = rng.uniform((-0.4, -0.3, 0.0), (0.4, 0.3, 1.8), good.points.shape)
     wardrobe = sampled(box((-0.4, -0.3, 0.0), (0.4, 0.3, 1.8)), 50_000)
     yield "no points", _with_points(good, good.points[:0])
     yield "NaN", _with_points(good, holed)
@@ -171,7 +171,7 @@ def bad_clouds(body: Mesh) -> Iterator[tuple[str, PointCloud]]:
 
 
 def _with_points(cloud: PointCloud, points: Array) -> PointCloud:
-    """Other points with the first normals."""
+    """Other points, at most as many, with the normals as they come."""
     count = len(points)
     return replace(
         cloud,

@@ -13,7 +13,7 @@ from station.depth.average import average
 from station.depth.people import count_people
 from station.depth.points import normals, project, rays
 from station.drivers.virtual import SimulatedBooth, render_bundle
-from station.drivers.virtual_scene import Mesh, default_rig, load_mesh
+from station.drivers.virtual_scene import Mesh, chair, default_rig, load_mesh
 from station.errors import InputError
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
@@ -117,6 +117,14 @@ def test_two_people_whose_arms_touch_are_two(tmp_path: Path, apart_m: float) -> 
     folder = render_bundle(_side_by_side(apart_m), tmp_path / "two", booth, frames=3)
     found = preprocess(read_bundle(folder)).findings
     assert "two-people" in {finding.code for finding in found}
+
+
+def test_a_chair_apart_is_no_second_person(tmp_path: Path) -> None:
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0, clutter=chair((0.75, 0.45)))
+    scan = preprocess(read_bundle(render_bundle(body, tmp_path / "chair", booth, frames=3)))
+    assert scan.findings == ()
+    assert scan.cloud.points[:, 0].max() < body.vertices[:, 0].max() + 0.02
 
 
 def test_a_raised_hand_is_no_second_head() -> None:
