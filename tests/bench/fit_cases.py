@@ -18,7 +18,7 @@ from station.drivers.virtual import SimulatedBooth
 from station.drivers.virtual_scene import Mesh, box, chair, default_rig, look_at
 from station.geometry import rigid, so3_exp
 from workers.scape.database import PARTS, BodyDatabase, Shapes
-from workers.scape.deformation import vertex_normals
+from workers.scape.intersections import self_intersections
 
 Array = NDArray[np.float64]
 Group = Literal["family", "other", "hard", "rig", "bad"]
@@ -26,6 +26,8 @@ Group = Literal["family", "other", "hard", "rig", "bad"]
 _POOL = 30
 _SEED = 11
 _POSES_TO_CHOOSE_FROM = 300
+_TOUCHING = 40
+"""Crossings of triangles that armpits and toes have in any pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,31 +53,41 @@ class TestBodies:
 
     @cached_property
     def arms_close(self) -> Mesh:
-        """The first body with its arms as near to the trunk as any held-out pose has them."""
+        """The leanest body, its arms as near to the trunk as any held-out pose has them and the
+        body has room for: an arm that is in the trunk can be seen by nobody."""
         poses = self._database.sample_poses("test", _POSES_TO_CHOOSE_FROM, _SEED + 1)
         lowered = [
             sign * poses[:, self._database.bones.index(f"upperarm01.{side}"), 1]
             for side, sign in (("L", 1.0), ("R", -1.0))
         ]
-        closest = int(np.argmax(np.minimum(*lowered)))
-        return self._made(self._shapes.take(np.array([0])), poses[closest])
+        closest_first = np.argsort(-np.minimum(*lowered), kind="stable")
+        shapes = self._shapes.take(self._leanest_first[:1])
+        touching = self_intersections(self._database.vertices(shapes)[0], self._database.faces)
+        for index in closest_first:
+            body = self._made(shapes, poses[index])
+            if self_intersections(body.vertices, body.faces) <= touching + _TOUCHING:
+                return body
+        raise RuntimeError("every held-out pose has an arm in the trunk")
 
     @cached_property
     def pregnant(self) -> Mesh:
-        """A woman whose belly stands 11 cm farther out, by a bump that no training body has."""
-        women = np.flatnonzero(self._shapes.phenotypes["gender"] > 0.5)
-        body = self.body(int(women[0]))
+        """The leanest woman, her belly 10 cm farther out by a bump that no training body has."""
+        women = self._shapes.phenotypes["gender"][self._leanest_first] > 0.5
+        body = self.body(int(self._leanest_first[women][0]))
         trunk = [list(PARTS).index(part) for part in ("pelvis", "abdomen", "chest")]
         share = self._database.part_weights[:, trunk].sum(axis=1)
         height = np.ptp(body.vertices[:, 2])
         middle = np.median(body.vertices[share > 0.9], axis=0)
-        across = (body.vertices[:, 0] - middle[0]) / 0.17
-        up = (body.vertices[:, 2] - 0.60 * height) / 0.19
-        bump = np.square(np.clip(1.0 - across**2 - up**2, 0.0, 1.0))
-        facing = np.clip(-vertex_normals(body.vertices, body.faces)[:, 1], 0.0, 1.0)
-        front = body.vertices[:, 1] < middle[1]
-        forward = 0.11 * share * bump * np.sqrt(facing) * front
+        across = (body.vertices[:, 0] - middle[0]) / 0.19
+        up = (body.vertices[:, 2] - 0.61 * height) / 0.21
+        inside = np.clip(1.0 - across**2 - up**2, 0.0, 1.0)
+        front = np.clip((middle[1] - body.vertices[:, 1]) / 0.04, 0.0, 1.0)
+        forward = 0.10 * share * front * inside**2 * (3.0 - 2.0 * inside)
         return Mesh(body.vertices - forward[:, None] * (0.0, 1.0, 0.0), body.faces)
+
+    @cached_property
+    def _leanest_first(self) -> NDArray[np.intp]:
+        return np.argsort(self._database.sizes(self._shapes)[1], kind="stable")
 
     def _made(self, shapes: Shapes, pose: Array) -> Mesh:
         vertices = self._database.vertices(shapes, pose[None])[0]
