@@ -275,8 +275,10 @@ def bad_input(model: BodyModel, cases: Iterable[Case], body: Mesh, folder: Path)
 
 def _print_outcome(name: str, status: str, reasons: Sequence[str]) -> bool:
     print(f"{name:<22}{status:<8}{reasons[0] if reasons else ''}", flush=True)
-    for reason in reasons[1:]:
+    for reason in reasons[1:3]:
         print(f"{'':<30}{reason}")
+    if len(reasons) > 3:
+        print(f"{'':<30}and {len(reasons) - 3} more")
     return status == "ok"
 
 

@@ -61,19 +61,22 @@ class TestBodies:
             for side, sign in (("L", 1.0), ("R", -1.0))
         ]
         closest_first = np.argsort(-np.minimum(*lowered), kind="stable")
-        shapes = self._shapes.take(self._leanest_first[:1])
-        touching = self_intersections(self._database.vertices(shapes)[0], self._database.faces)
+        leanest = int(self._leanest_first[0])
         for index in closest_first:
-            body = self._made(shapes, poses[index])
-            if self_intersections(body.vertices, body.faces) <= touching + _TOUCHING:
-                return body
+            if self._has_room(leanest, poses[index]):
+                return self._made(self._shapes.take(np.array([leanest])), poses[index])
         raise RuntimeError("every held-out pose has an arm in the trunk")
 
     @cached_property
     def pregnant(self) -> Mesh:
         """The leanest woman, her belly 10 cm farther out by a bump that no training body has."""
         women = self._shapes.phenotypes["gender"][self._leanest_first] > 0.5
-        body = self.body(int(self._leanest_first[women][0]))
+        roomy = (
+            int(index)
+            for index in self._leanest_first[women]
+            if self._has_room(int(index), self._poses[index])
+        )
+        body = self.body(next(roomy))
         trunk = [list(PARTS).index(part) for part in ("pelvis", "abdomen", "chest")]
         share = self._database.part_weights[:, trunk].sum(axis=1)
         height = np.ptp(body.vertices[:, 2])
@@ -84,6 +87,13 @@ class TestBodies:
         front = np.clip((middle[1] - body.vertices[:, 1]) / 0.04, 0.0, 1.0)
         forward = 0.10 * share * front * inside**2 * (3.0 - 2.0 * inside)
         return Mesh(body.vertices - forward[:, None] * (0.0, 1.0, 0.0), body.faces)
+
+    def _has_room(self, index: int, pose: Array) -> bool:
+        """Whether no limb of a body is in its trunk in a pose."""
+        shapes = self._shapes.take(np.array([index]))
+        neutral, posed = self._database.vertices(shapes)[0], self._made(shapes, pose).vertices
+        faces = self._database.faces
+        return self_intersections(posed, faces) <= self_intersections(neutral, faces) + _TOUCHING
 
     @cached_property
     def _leanest_first(self) -> NDArray[np.intp]:
