@@ -22,6 +22,9 @@ _SIGMA_M = 0.001
 def read_cloud(path: Path, up: str) -> PointCloud:
     """Read a cloud in metres; its lowest points become the floor, its middle the mark.
 
+    Where that was in the file, after `up`, is the cloud's origin_m. The same file gives the same
+    points.
+
     Args:
         up: "z" or "y", the axis that points up.
 
@@ -37,7 +40,8 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not numbers; repair it")
     if len(points) > _MOST_POINTS:
-        cloud = cloud.random_down_sample(_MOST_POINTS / len(points))
+        kept = np.random.default_rng(len(points)).permutation(len(points))[:_MOST_POINTS]
+        cloud = cloud.select_by_index(np.sort(kept))
     if not cloud.has_normals():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
         cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
@@ -48,12 +52,14 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
         normals = -normals
     middle[2] = points[:, 2].min()
+    x, y, z = (float(value) for value in middle)
     return PointCloud(
         points=points - middle,
         normals=normals,
         sigma_m=np.full(len(points), _SIGMA_M),
         camera=np.zeros(len(points), np.int16),
         camera_names=("cloud",),
+        origin_m=(x, y, z),
     )
 
 

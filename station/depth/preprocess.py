@@ -14,6 +14,7 @@ from scipy import ndimage
 from station.bundle import Bundle
 from station.calibration.rig import CameraCalibration
 from station.depth.average import average, random_sigma_m
+from station.depth.people import count_people
 from station.depth.points import Image, camera_points, jumps, normals
 from station.errors import InputError
 
@@ -27,9 +28,13 @@ _MAX_INCIDENCE_COSINE = np.cos(np.radians(76.0))
 _VOXEL_M = 0.04
 _LEAST_POINTS = 2000
 _SECOND_PERSON_SHARE = 0.15
-_SECOND_PERSON_HEIGHT_M = 0.7
+_SECOND_PERSON_HEIGHT_M = 1.1
+"""A chair that stands apart harms nothing; another adult is another scan."""
+_PEOPLE_STRIDE = 4
 _MOTION_M = 0.010
 _UNSETTLED_SHARE = 0.25
+_PLENTY_OF_FRAMES = 10
+"""A scan that has so many lacks none, however long it took to get them."""
 _SIGMA_FLOOR_M = 4e-4
 """What averaging more frames does not take away: quantisation, calibration."""
 
@@ -79,6 +84,8 @@ class PointCloud:
     camera: NDArray[np.int16]
     """(n,): index into camera_names."""
     camera_names: tuple[str, ...]
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the origin of a bare cloud's points was in its own frame, turned z up."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -107,6 +114,8 @@ class _Camera:
     unsettled: float
     """Share of the readings in the volume that do not agree over the frames."""
     frames: int
+    ordered: int
+    """How many it would have been but for gaps in their sequence, where that is few."""
 
 
 def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
@@ -122,7 +131,7 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         cameras = list(pool.map(lambda name: _camera(bundle, name, volume), names))
     kept, findings = _one_person([camera.points for camera in cameras])
     views, clouds = [], []
-    expected = max(camera.frames for camera in cameras)
+    expected = max(max(camera.frames, camera.ordered) for camera in cameras)
     for name, camera, keep in zip(names, cameras, kept, strict=True):
         view, cloud = _cleaned(camera, keep)
         views.append(view)
@@ -152,7 +161,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         none = np.empty(0)
         return _Camera(
             calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
-            unsettled, len(bundle.frames[name]),
+            unsettled, len(bundle.frames[name]), _ordered(bundle, name),
         )  # fmt: skip
     # Everything from here on is done on the person's part of the image alone.
     top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, depth.shape[0])
@@ -189,7 +198,13 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         change_m=averaged.change_m[window][valid].astype(np.float64),
         unsettled=unsettled,
         frames=len(bundle.frames[name]),
+        ordered=_ordered(bundle, name),
     )
+
+
+def _ordered(bundle: Bundle, name: str) -> int:
+    numbers = [record.sequence for record in bundle.frames[name]]
+    return min(max(numbers) - min(numbers) + 1, _PLENTY_OF_FRAMES)
 
 
 def _in_volume(points: Image, depth: Image, pose: Array, volume: Volume) -> Mask:
@@ -217,17 +232,17 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
     main = int(np.argmax(sizes))
-    findings = []
-    for label in range(1, count + 1):
-        if label == main or sizes[label] < _SECOND_PERSON_SHARE * sizes[main]:
-            continue
-        height = np.ptp(everything[of_point == label, 2])
-        if height > _SECOND_PERSON_HEIGHT_M:
-            findings.append(
-                Finding("two-people", None, None, "two people (or a large object) in the booth")
-            )
-            break
     keep = of_point == main
+    beside = any(
+        sizes[label] > _SECOND_PERSON_SHARE * sizes[main]
+        and np.ptp(everything[of_point == label, 2]) > _SECOND_PERSON_HEIGHT_M
+        for label in range(1, count + 1)
+        if label != main
+    )
+    findings = []
+    if beside or count_people(everything[keep][::_PEOPLE_STRIDE]) > 1:
+        message = "two people (or a large object) in the booth"
+        findings.append(Finding("two-people", None, None, message))
     ends = np.cumsum([len(part) for part in points])
     return np.split(keep, ends[:-1]), findings
 

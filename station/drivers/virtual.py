@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.bundle import CapturedFrame, write_bundle
-from station.calibration.rig import CameraCalibration, Rig
+from station.calibration.rig import Rig
 from station.drivers.base import DepthFrame, DeviceInfo
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual_noise import TrueView, UnitError, observe
@@ -30,8 +30,9 @@ Array = NDArray[np.float64]
 
 TICK_HZ = 60_000_000
 FRAME_RATE_HZ = 30.0
-_SWAY_PHASES = 12
 _SWAY_PERIOD_S = 3.1
+_LEAN_STEP_M = 0.00025
+"""A view is rendered anew when the person leans by so much more: far below the sensor's noise."""
 _LIVE_LOOP_FRAMES = 24
 
 
@@ -43,13 +44,15 @@ class SimulatedBooth:
     """The calibration that the station believes."""
     seed: int = 0
     sway_m: float = 0.002
-    """How far the person moves to either side."""
+    """How far the head moves to either side, in a period of three seconds."""
     bias_m: float = 0.0
     """Size of each unit's systematic depth error at 2 m."""
     drop_rate: float = 0.0
     """Share of the frames that are lost."""
     moved_cameras: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Camera -> (metres, radians) by which it stands off its calibration."""
+    dead_cameras: Collection[str] = ()
+    """Cameras that give no frame."""
     clutter: Sequence[Mesh] = ()
     """Further objects: a chair, a second person."""
     walls: bool = True
@@ -101,42 +104,44 @@ class VirtualCamera:
         self._rng = np.random.default_rng((booth.seed, index))
         self._booth, self._camera = booth, camera
         self.unit = SimulatedUnit.of(booth, name)
-        self._views = _sway_views(booth, camera, body)
+        self._body = body
+        # One person, one sway: all cameras see the same phase.
+        self._sway_phase = float(np.random.default_rng((booth.seed, 7, 7)).random())
+        self._views: dict[float, TrueView] = {}
 
     def frames(self, count: int) -> Iterator[VirtualFrame]:
         """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
         for sequence in range(count):
             time_s = self.unit.phase_s + sequence / FRAME_RATE_HZ
-            phase = int(time_s / _SWAY_PERIOD_S * len(self._views)) % len(self._views)
-            raw = observe(self._views[phase], self.unit.error, self._rng)
+            raw = observe(self._view(time_s), self.unit.error, self._rng)
             if self._rng.random() < self._booth.drop_rate:
                 continue
             yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
 
+    def _view(self, time_s: float) -> TrueView:
+        """What a perfect sensor would see at a time, rendered once for each lean."""
+        booth, camera = self._booth, self._camera
+        turns = time_s / _SWAY_PERIOD_S + self._sway_phase
+        sway_m = 0.0 if self._body is None else booth.sway_m
+        lean_m = sway_m * float(np.sin(2.0 * np.pi * turns))
+        lean_m = _LEAN_STEP_M * round(lean_m / _LEAN_STEP_M)
+        if lean_m not in self._views:
+            pose = camera.world_from_camera
+            if camera.name in booth.moved_cameras:
+                pose = moved(pose, *booth.moved_cameras[camera.name])
+            meshes = [*(booth_walls() if booth.walls else ()), *booth.clutter]
+            if self._body is not None:
+                meshes.append(_leaning(self._body, lean_m))
+            if not meshes:
+                raise InputError("the virtual booth holds nothing to look at")
+            self._views[lean_m] = VirtualScene(meshes).view(camera, pose)
+        return self._views[lean_m]
 
-def _sway_views(
-    booth: SimulatedBooth, camera: CameraCalibration, body: Mesh | None
-) -> list[TrueView]:
-    pose = camera.world_from_camera
-    if camera.name in booth.moved_cameras:
-        pose = moved(pose, *booth.moved_cameras[camera.name])
-    around = [*(booth_walls() if booth.walls else ()), *booth.clutter]
-    if body is None or booth.sway_m == 0.0:
-        meshes = [*around, *([body] if body is not None else [])]
-        if not meshes:
-            raise InputError("the virtual booth holds nothing to look at")
-        return [VirtualScene(meshes).view(camera, pose)]
-    seen: dict[float, TrueView] = {}
-    leans = [
-        round(booth.sway_m * float(np.sin(2.0 * np.pi * phase / _SWAY_PHASES)), 6)
-        for phase in range(_SWAY_PHASES)
-    ]
-    # Feet stay; the rest leans with height.
+
+def _leaning(body: Mesh, lean_m: float) -> Mesh:
+    """Feet stay; the rest leans with height."""
     share = np.clip(body.vertices[:, 2:] / 1.7, 0.0, 1.2) * (0.6, 0.8, 0.0)
-    for lean in dict.fromkeys(leans):
-        swayed = Mesh(body.vertices + share * lean, body.faces, body.dark)
-        seen[lean] = VirtualScene([*around, swayed]).view(camera, pose)
-    return [seen[lean] for lean in leans]
+    return Mesh(body.vertices + share * lean_m, body.faces, body.dark)
 
 
 def render_bundle(
@@ -154,7 +159,7 @@ def render_bundle(
         camera = VirtualCamera(booth, name, body)
         taken[name] = [
             CapturedFrame(TABLE[frame.raw], frame.ticks, TICK_HZ, frame.time_s, frame.sequence)
-            for frame in camera.frames(frames)
+            for frame in camera.frames(0 if name in booth.dead_cameras else frames)
         ]
     write_bundle(
         folder,

@@ -1,9 +1,10 @@
 """What a structured-light Kinect v1 does to a true depth image.
 
-Geometry and figures: baseline 75 mm, disparity steps of 1/8 px (Khoshelham & Elberink 2012: random
-error 1.425e-3 z^2 m), errors correlated over the matching window of about 9 x 9 px, no reading
-beyond 70-75 degrees of incidence or in the projector's shadow, silhouette pixels that flicker and
-fly (Nguyen, Izadi & Lovell 2012). Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
+Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
+and fly: Nguyen, Izadi & Lovell 2012. (What reads the images assumes the other published law, that
+of Khoshelham & Elberink: it shall not be judged by its own assumption.) Errors are correlated over
+the matching window of about 9 x 9 px; there is no reading beyond 70-75 degrees of incidence or in
+the projector's shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 from station.drivers.raw11 import NO_READING
 
 BASELINE_M = 0.075
-_RANDOM_COEFFICIENT = 1.425e-3
 _WINDOW_PX = 9
 _FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
+_STEEP_RAD = np.radians(60.0)
 _RANGE_M = (0.5, 4.5)
 
 Image = NDArray[np.float32]
@@ -80,6 +81,14 @@ class UnitError:
         return np.asarray(depth_m + self.bias_m * shape * np.square(depth_m / 2.0), np.float32)
 
 
+def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
+    """Standard deviation of a reading along the axis (Nguyen, Izadi & Lovell 2012), metres."""
+    facing = 0.0012 + 0.0019 * np.square(depth_m - 0.4)
+    angle = np.minimum(incidence_rad, np.float32(1.5))
+    steep = np.square(angle / (0.5 * np.pi - angle)) * (1e-4 / np.sqrt(np.maximum(depth_m, 0.1)))
+    return np.asarray(facing + np.where(angle > _STEEP_RAD, steep, 0.0), np.float32)
+
+
 def observe(
     view: TrueView, unit: UnitError, rng: np.random.Generator, window: Window | None = None
 ) -> NDArray[np.uint16]:
@@ -89,8 +98,7 @@ def observe(
     white = rng.standard_normal(depth.shape, dtype=np.float32)
     blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
     noise = blurred / max(float(blurred.std()), 1e-6)
-    grazing = np.cos(np.minimum(view.incidence_rad, _FADE_END_RAD))
-    sigma = _RANDOM_COEFFICIENT * np.square(depth) / np.sqrt(np.maximum(grazing, 0.2))
+    sigma = axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD))
     measured = np.where(seen, depth + sigma * noise, 0.0).astype(np.float32)
     fade = (view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD)
     measured[rng.random(depth.shape, dtype=np.float32) < fade] = 0.0

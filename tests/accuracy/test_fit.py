@@ -1,5 +1,8 @@
 """The fit on a body that the model was not trained on, seen through the simulated sensors."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +64,21 @@ def test_the_mesh_is_watertight_and_not_folded(model: BodyModel, fitted: FitResu
 def test_same_input_same_output(model: BodyModel, bundle: Path, fitted: FitResult) -> None:
     again = fit_body(model, preprocess(read_bundle(bundle)))
     assert again.vertices.tobytes() == fitted.vertices.tobytes()
+
+
+def test_the_mesh_is_the_same_whatever_the_thread_count(bundle: Path, tmp_path: Path) -> None:
+    meshes = []
+    for threads in ("1", "4"):
+        out = tmp_path / threads
+        variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+        subprocess.run(
+            [sys.executable, "-m", "workers.cli", "fit", str(bundle), "--out", str(out), "--quiet"],
+            env={**os.environ, **dict.fromkeys(variables, threads)},
+            check=True,
+            timeout=120,
+        )
+        meshes.append((out / "mesh.ply").read_bytes())
+    assert meshes[0] == meshes[1]
 
 
 def test_the_paper_method_gives_a_body_too(model: BodyModel, bundle: Path) -> None:

@@ -1,5 +1,6 @@
 """Averaging, cleaning and merging a bundle's frames."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import pytest
 from station.bundle import read_bundle
 from station.depth import Volume, preprocess
 from station.depth.average import average
+from station.depth.people import count_people
 from station.depth.points import normals, project, rays
 from station.drivers.virtual import SimulatedBooth, render_bundle
-from station.drivers.virtual_scene import Mesh, default_rig, load_mesh
+from station.drivers.virtual_scene import Mesh, chair, default_rig, load_mesh
 from station.errors import InputError
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
@@ -98,3 +100,50 @@ def test_the_cloud_is_one_person_without_floor_and_walls(bundle: Path) -> None:
     assert set(scan.cloud.camera) == {0, 1, 2, 3}
     for view in scan.views:
         assert not (view.person & view.background).any()
+
+
+def _side_by_side(apart_m: float) -> Mesh:
+    """Two bodies in one mesh."""
+    ann, cleo = load_mesh(BODIES / "ann.npz"), load_mesh(BODIES / "cleo.npz")
+    aside = np.array([apart_m / 2, 0.0, 0.0])
+    left, right = ann.vertices - aside, cleo.vertices + aside
+    return Mesh(np.concatenate([left, right]), np.concatenate([ann.faces, cleo.faces + len(left)]))
+
+
+@pytest.mark.parametrize("apart_m", [0.5, 0.7])
+def test_two_people_whose_arms_touch_are_two(tmp_path: Path, apart_m: float) -> None:
+    """They are one piece of cloud, and were one person in silence."""
+    booth = SimulatedBooth(seed=1, sway_m=0.0)
+    folder = render_bundle(_side_by_side(apart_m), tmp_path / "two", booth, frames=3)
+    found = preprocess(read_bundle(folder)).findings
+    assert "two-people" in {finding.code for finding in found}
+
+
+def test_a_chair_apart_is_no_second_person(tmp_path: Path) -> None:
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0, clutter=chair((0.75, 0.45)))
+    scan = preprocess(read_bundle(render_bundle(body, tmp_path / "chair", booth, frames=3)))
+    assert scan.findings == ()
+    assert scan.cloud.points[:, 0].max() < body.vertices[:, 0].max() + 0.02
+
+
+def test_a_raised_hand_is_no_second_head() -> None:
+    rng = np.random.default_rng(0)
+    trunk = rng.uniform((-0.2, -0.12, 0.0), (0.2, 0.12, 1.45), (20_000, 3))
+    head = rng.uniform((-0.08, -0.1, 1.45), (0.08, 0.1, 1.75), (3000, 3))
+    arm = rng.uniform((0.2, -0.04, 1.3), (0.5, 0.04, 1.4), (2000, 3))
+    hand = rng.uniform((0.42, -0.04, 1.4), (0.5, 0.04, 1.75), (1000, 3))
+    assert count_people(np.concatenate([trunk, head, arm, hand])) == 1
+
+
+def test_frames_that_all_cameras_lost_are_reported(tmp_path: Path) -> None:
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0)
+    folder = render_bundle(body, tmp_path / "few", booth)
+    manifest = json.loads((folder / "bundle.json").read_text())
+    for camera in manifest["cameras"].values():
+        camera["frames"] = camera["frames"][::3]
+    (folder / "bundle.json").write_text(json.dumps(manifest))
+    found = preprocess(read_bundle(folder)).findings
+    assert [finding.camera for finding in found] == list(booth.rig.cameras)
+    assert all("gave 4 of 10 frames" in finding.message for finding in found)

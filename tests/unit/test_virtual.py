@@ -9,7 +9,7 @@ from station.config import CameraConfig
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
 from station.drivers.registry import make_driver
 from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
-from station.drivers.virtual_noise import raw_from_depth
+from station.drivers.virtual_noise import axial_sigma_m, raw_from_depth
 from station.drivers.virtual_scene import default_rig, load_mesh, sphere
 from station.errors import DriverError, FormatError, InputError
 from station.recording import check_recording, read_raw, write_recording
@@ -52,15 +52,36 @@ def test_the_same_seed_gives_the_same_frames() -> None:
 
 
 def test_the_random_error_grows_as_published() -> None:
-    """sigma_z = 1.425e-3 z^2 (Khoshelham & Elberink 2012), here beside quantisation."""
+    """sigma_z = 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al. 2012), here beside quantisation."""
     booth = SimulatedBooth(walls=False, clutter=[sphere((0, 0, 1.47), 0.3)])
     frames = VirtualCamera(booth, "front-upper", None).frames(30)
     stack = np.stack([TABLE[frame.raw] for frame in frames]) * DEPTH_SCALE_M
     nearest = stack[:, 238:242, 318:322].reshape(30, -1)
     z = nearest.mean()
     step = z**2 / (8 * 585 * 0.075)
-    expected = np.hypot(1.425e-3 * z**2, step / np.sqrt(12))
+    expected = np.hypot(0.0012 + 0.0019 * (z - 0.4) ** 2, step / np.sqrt(12))
     assert nearest.std(axis=0).mean() == pytest.approx(expected, rel=0.35)
+
+
+def test_grazing_surfaces_are_noisier() -> None:
+    depth = np.full(3, 1.6, np.float32)
+    sigma = axial_sigma_m(depth, np.radians([0.0, 59.0, 75.0]).astype(np.float32))
+    assert sigma[0] == sigma[1]
+    assert sigma[2] > 1.4 * sigma[0]
+
+
+def test_a_swaying_person_leans_from_frame_to_frame() -> None:
+    """Ten frames of a sway of 10 mm saw nearly none of it: all began upright, in coarse steps."""
+    spans, starts = [], []
+    for seed in range(5):
+        booth = SimulatedBooth(walls=False, sway_m=0.01, seed=seed)
+        frames = VirtualCamera(booth, "front-upper", sphere((0.0, 0.0, 1.47), 0.2)).frames(10)
+        depths = [TABLE[frame.raw] * DEPTH_SCALE_M for frame in frames]
+        middles = [float(depth[200:280, 280:360].mean()) for depth in depths]
+        spans.append(np.ptp(middles))
+        starts.append(middles[0])
+    assert max(spans) > 0.002
+    assert np.ptp(starts) > 0.004
 
 
 def test_a_live_virtual_sensor_keeps_time() -> None:

@@ -58,7 +58,7 @@ def write_result(
             (folder / name).write_bytes(content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     seconds = {**watch.seconds, "total": watch.total_s()}
-    document = result_document(model, fit, scan_id, method, seconds, hashes)
+    document = result_document(model, fit, cloud.origin_m, scan_id, method, seconds, hashes)
     (folder / "result.json").write_bytes(_json(document))
 
 
@@ -95,6 +95,7 @@ def measurements_document(scan_id: str, measured: MeasuredBody) -> dict[str, Any
 def result_document(
     model: BodyModel,
     fit: FitResult,
+    origin_m: tuple[float, float, float],
     scan_id: str,
     method: str,
     seconds: dict[str, float],
@@ -113,6 +114,7 @@ def result_document(
         "shape": fit.state.beta.tolist(),
         "pose": dict(zip(model.part_names, twists.tolist(), strict=True)),
         "translation": fit.state.translation.tolist(),
+        "origin_m": list(origin_m),
         "quality": {
             "point_to_surface_rms_m": fit.point_to_surface_rms_m,
             "coverage": fit.coverage,

@@ -1,0 +1,93 @@
+"""How far a result lies from the true surface, measured at the true surface's points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from station.drivers.virtual_scene import Mesh
+from workers.scape.deformation import vertex_areas
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+
+_HAND = ("hand", "thumb", "fingers")
+_EXTREMITIES = ("hand", "foot")
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceErrors:
+    """Millimetres, weighted by the true surface's area."""
+
+    body_rms: float
+    """Trunk, limbs and head."""
+    extremity_rms: float
+    """Hands and feet."""
+    seen_median: float
+    """Trunk, limbs and head where a camera saw the surface."""
+    seen_extremity_median: float
+    height: float
+    """Signed."""
+    by_part: dict[str, float]
+    """rms; a hand with its fingers is one part, as in the verdict."""
+
+    @property
+    def worst_part(self) -> tuple[str, float]:
+        return max(self.by_part.items(), key=lambda item: item[1])
+
+
+def distances_m(vertices: Array, faces: NDArray[np.int32], points: Array) -> Array:
+    """(n,): from points to a surface."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+    )
+    found = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)))
+    return np.asarray(found.numpy(), np.float64)
+
+
+def surface_errors(
+    model: BodyModel, vertices: Array, seen: NDArray[np.bool_] | None, truth: Mesh
+) -> SurfaceErrors:
+    """Compare a result's vertices (P, 3), of which some were seen (P,), with the true surface."""
+    away = 1e3 * distances_m(vertices, model.faces, truth.vertices)
+    area = vertex_areas(truth.vertices, truth.faces)
+    nearest = cKDTree(vertices).query(truth.vertices)[1]
+    # A test body's own vertices say which part they are of, however far the result is away.
+    same = np.array_equal(truth.faces, model.faces)
+    part = model.part_of_vertex if same else model.part_of_vertex[nearest]
+    names = np.array([_operators_name(name) for name in model.part_names])[part]
+    extremity = np.char.startswith(names, _EXTREMITIES[0]) | np.char.startswith(
+        names, _EXTREMITIES[1]
+    )
+    visible = np.ones(len(away), bool) if seen is None else seen[nearest]
+    return SurfaceErrors(
+        body_rms=_rms(away, area, ~extremity),
+        extremity_rms=_rms(away, area, extremity),
+        seen_median=_median(away, area, ~extremity & visible),
+        seen_extremity_median=_median(away, area, extremity & visible),
+        height=1e3 * float(np.ptp(vertices[:, 2]) - np.ptp(truth.vertices[:, 2])),
+        by_part={str(name): _rms(away, area, names == name) for name in np.unique(names)},
+    )
+
+
+def _operators_name(part: str) -> str:
+    stem, _, side = part.rpartition("_")
+    return f"hand_{side}" if stem in _HAND else part
+
+
+def _rms(away: Array, area: Array, chosen: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(np.average(np.square(away[chosen]), weights=area[chosen])))
+
+
+def _median(away: Array, area: Array, chosen: NDArray[np.bool_]) -> float:
+    """Half of the chosen area lies nearer."""
+    if not chosen.any():
+        return float("nan")
+    order = np.argsort(away[chosen])
+    share = np.cumsum(area[chosen][order])
+    return float(away[chosen][order][np.searchsorted(share, 0.5 * share[-1])])

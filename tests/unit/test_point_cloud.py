@@ -1,0 +1,33 @@
+"""Reading a bare cloud: the same points each time, and the way back to the scanner's frame."""
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from workers import point_cloud
+from workers.point_cloud import read_cloud
+
+
+def _written(path: Path, points: np.ndarray) -> Path:
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    o3d.io.write_point_cloud(str(path), cloud)
+    return path
+
+
+def test_a_cloud_goes_back_to_where_it_was(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).uniform((1.0, 5.0, -3.0), (2.0, 6.0, -1.0), (500, 3))
+    cloud = read_cloud(_written(tmp_path / "a.ply", points), "z")
+    assert np.allclose(cloud.points + cloud.origin_m, points, atol=1e-6)
+    assert cloud.points[:, 2].min() == 0.0
+    turned = read_cloud(_written(tmp_path / "b.ply", points[:, [0, 2, 1]] * (1, 1, -1)), "y")
+    assert np.allclose(turned.points + turned.origin_m, points, atol=1e-6)
+
+
+def test_a_large_cloud_is_thinned_the_same_way_each_time(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).uniform(0.0, 1.0, (260_000, 3))
+    path = _written(tmp_path / "large.ply", points)
+    first, again = read_cloud(path, "z"), read_cloud(path, "z")
+    assert len(first) == point_cloud._MOST_POINTS
+    assert np.array_equal(first.points, again.points)
