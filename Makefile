@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-fit bench-calibration bench-drift
+BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
 .PHONY: help demo test check format train evaluate-model intervals clean $(BENCHES)
 

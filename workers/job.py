@@ -73,7 +73,7 @@ def reconstruct_bundle(
     with watch.step("preprocess"):
         scan = preprocess(bundle, volume)
     fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
-    return _finish(model, fit, scan.cloud, bundle.scan_id, method, out_folder, watch, progress)
+    return _finish(model, fit, bundle.scan_id, method, out_folder, watch, progress)
 
 
 def reconstruct_cloud(
@@ -93,13 +93,12 @@ def reconstruct_cloud(
     with watch.step("preprocess"):
         scan = Preprocessed(cloud, (), ())
     fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
-    return _finish(model, fit, cloud, scan_id, method, out_folder, watch, progress)
+    return _finish(model, fit, scan_id, method, out_folder, watch, progress)
 
 
 def _finish(
     model: BodyModel,
     fit: FitResult,
-    cloud: PointCloud,
     scan_id: str,
     method: Method,
     out_folder: Path,
@@ -112,5 +111,5 @@ def _finish(
         measured = measure_body(model, fit.vertices, fit.vertex_sigma_m)
         standing = measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
-    write_result(out_folder, model, fit, cloud, measured, standing, scan_id, method, watch)
+    write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

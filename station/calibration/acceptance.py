@@ -25,6 +25,7 @@ LARGEST_RMS_M = 0.006
 LARGEST_MEAN_M = 0.0025
 """Of a camera's held-out detections together, where the noise averages out."""
 _LEAST = 15
+"""Fewer comparisons prove nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +38,12 @@ class HeldOut:
     """(3,) reference frame."""
 
     @property
+    def tested(self) -> bool:
+        return self.detections >= _LEAST
+
+    @property
     def acceptable(self) -> bool:
-        """Few comparisons cannot speak against a camera by their mean."""
+        """The mean is allowed what its own noise can be."""
         allowed = LARGEST_MEAN_M + 3.0 * self.rms_m / np.sqrt(max(self.detections, 1))
         return self.rms_m < LARGEST_RMS_M and float(np.linalg.norm(self.mean_m)) < allowed
 

@@ -1,4 +1,4 @@
-"""A ChArUco board in infrared or colour images: what it says of the lenses and of the calibration.
+"""A ChArUco board in infrared images: what it says of the lenses and of the calibration.
 
 Free intrinsics can give the same reprojection error as the factory's and yet put points centimetres
 off. So they are taken only when two halves of the views agree about them in millimetres where the
@@ -31,6 +31,8 @@ _OTHER_LAYOUT_PX = 6.0
 _CERTAIN_M = 0.0015
 """A lens has to be known so well, in 95 % of the image, at the working distance."""
 _BETTER = 0.9
+_OTHER_SENSOR = 0.03
+"""A unit's focal length varies by less; colour and depth differ by more."""
 """Held-out errors have to fall below this share of the factory's."""
 _SIZE_TOLERANCE = 0.02
 _HELD_OUT_EVERY = 3
@@ -183,9 +185,16 @@ def judge_lens(camera: CameraCalibration, views: Sequence[BoardView], board: Boa
         certain_m=_apart_m(*halves) * float(np.sqrt(0.25 * len(used) / len(views))),
         lens=None,
     )
-    if report.certain_m <= _CERTAIN_M and report.free_m < _BETTER * report.factory_m:
-        return replace(report, lens=_fitted(camera, views, board))
-    return report
+    if report.certain_m > _CERTAIN_M or report.free_m >= _BETTER * report.factory_m:
+        return report
+    lens = _fitted(camera, views, board)
+    apart = float(np.abs(np.diag(lens.K)[:2] / np.diag(camera.K)[:2] - 1.0).max())
+    if apart > _OTHER_SENSOR:
+        raise CalibrationError(
+            f"camera {camera.name}: the images' focal length is {100 * apart:.0f} % off its depth "
+            "lens: give infrared images, colour ones have another lens"
+        )
+    return replace(report, lens=lens)
 
 
 def _fitted(

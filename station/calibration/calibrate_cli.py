@@ -99,8 +99,13 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(
         *args: Any, config_path: Path | None, recordings: Path | None, yes: bool, **kwargs: Any
     ) -> Any:
-        if click.get_current_context().invoked_subcommand is not None:
-            return None  # the step has these options itself
+        context = click.get_current_context()
+        if context.invoked_subcommand is not None:
+            if any([config_path, recordings, yes, *kwargs.values()]):
+                raise click.UsageError(
+                    f"put options after the step: station calibrate {context.invoked_subcommand} ..."
+                )
+            return None
         config = load_config(find_config(config_path))
         store = CalibrationStore(config.calibrate.folder, config.calibration)
         attended = not yes and recordings is None
@@ -309,7 +314,7 @@ def solve_again(booth: _Booth) -> None:
     "--images",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     required=True,
-    help="infrared or colour images: DIR/<camera>/<moment>.png",
+    help="infrared images: DIR/<camera>/<moment>.png",
 )
 @click.option("--squares", default="7x5", show_default=True, help="across x down")
 @click.option("--square", "square_m", default=0.06, show_default=True, help="side, metres")

@@ -126,7 +126,7 @@ def solve(
     _check_counts(covered)
     measured_m = _check_radius(observations.balls, radius_m)
     detections = sorted_detections(observations.balls, list(cameras), radius_m)
-    _check_rest(observations)
+    _check_rest(observations, front_cameras)
 
     progress("relating pairs of cameras")
     pairs = relate_all({name: own.track for name, own in detections.items()})
@@ -243,10 +243,15 @@ def _check_radius(balls: Sequence[BallDetection], radius_m: float) -> float:
     return measured
 
 
-def _check_rest(observations: Observations) -> None:
+def _check_rest(observations: Observations, front_cameras: Sequence[str]) -> None:
     if not observations.mark:
         raise CalibrationError(
-            "the ball was not seen on the mark; put it there and do the floor step again"
+            "the ball was not seen on the mark: lay it there, and run station calibrate mark"
+        )
+    if not observations.front and not front_cameras:
+        raise CalibrationError(
+            "nothing says where the person faces: name the cameras in front (calibrate.front in "
+            "booth.toml), or run station calibrate mark --front"
         )
 
 
@@ -300,8 +305,15 @@ def _check_scatter(state: State) -> None:
 
 
 def _check_held_out(found: Mapping[str, HeldOut]) -> None:
-    name = max(found, key=lambda name: found[name].rms_m)
-    if not all(one.acceptable for one in found.values()):
+    untested = [name for name, one in found.items() if not one.tested]
+    if untested:
+        raise CalibrationError(
+            f"camera {untested[0]} could not be tested: wave the ball longer where it and another "
+            "camera see it"
+        )
+    refused = {name: one for name, one in found.items() if not one.acceptable}
+    if refused:
+        name = max(refused, key=lambda name: refused[name].rms_m)
         away_mm = 1e3 * float(np.linalg.norm(found[name].mean_m))
         raise CalibrationError(
             f"camera {name} is off by {away_mm:.1f} mm ({1e3 * found[name].rms_m:.1f} mm rms) "

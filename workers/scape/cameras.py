@@ -57,6 +57,17 @@ class CameraCorrections:
     def __len__(self) -> int:
         return len(self.xi)
 
+    def corrected(self, cloud: PointCloud) -> PointCloud:
+        """The cloud where the corrections have it."""
+        if not len(self):
+            return cloud
+        turns = so3_exp(self.xi[cloud.camera, :3])
+        return replace(
+            cloud,
+            points=self.moved(cloud.points, cloud.camera),
+            normals=np.einsum("cij,cj->ci", turns, cloud.normals),
+        )
+
     def moved(self, points: Array, camera: Index) -> Array:
         """Points (n, 3) of cameras (n,) where the corrections have them."""
         if not len(self):

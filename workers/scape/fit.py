@@ -60,6 +60,8 @@ class FitResult:
     state: BodyState
     vertices: Array
     """(P, 3): the surface, world frame, metres."""
+    cloud: PointCloud
+    """What the surface was laid on: the scan's, its cameras corrected."""
     vertex_sigma_m: Array
     """(P,): posterior standard deviation along the normal."""
     vertex_seen: NDArray[np.bool_]
@@ -127,14 +129,14 @@ def _fit(
         observer("joint", {"vertices": joint.vertices})
         fitted = time.monotonic()
         progress("surface", 0.0)
-        cloud = replace(cloud, points=cameras.moved(cloud.points, cloud.camera))
+        cloud = cameras.corrected(cloud)
         surface = fit_surface(model, joint.vertices, cloud)
         free = untangled(model, surface.vertices, joint.vertices)
         surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
-    shifts = cameras.shifts_m(cloud)
+    shifts = cameras.shifts_m(scan.cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
     # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
@@ -145,6 +147,7 @@ def _fit(
     return FitResult(
         state=state,
         vertices=delivered,
+        cloud=cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,

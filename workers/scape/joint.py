@@ -143,9 +143,6 @@ class JointResult:
     state: BodyState
     cameras: CameraCorrections
     vertices: Array
-    covariance: Array
-    """(D + 6 C, D + 6 C) of (rotations, beta, translation), see SampledBody.jacobian, and of the
-    cameras' corrections."""
     correspondences: int
     iterations: int
 
@@ -162,7 +159,6 @@ def fit_jointly(
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
-    information = np.eye(1)
     terms: _DataTerms | None = None
     for step, stage in enumerate(schedule):
         body, sample_of_vertex = sampling.stage(stage.samples)
@@ -170,13 +166,10 @@ def fit_jointly(
         terms = _data_terms(
             model, target, cameras, vertices, stage, sample_of_vertex, len(body.indices), observer
         )
-        state, cameras, information = _step(model, body, state, cameras, stage, terms, prior)
+        state, cameras = _step(model, body, state, cameras, stage, terms, prior)
         progress((step + 1) / len(schedule))
-    covariance = scipy.linalg.inv(information)
     assert terms is not None
-    return JointResult(
-        state, cameras, model.vertices(state), covariance, terms.correspondences, len(schedule)
-    )
+    return JointResult(state, cameras, model.vertices(state), terms.correspondences, len(schedule))
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,8 +253,8 @@ def _step(
     stage: Stage,
     terms: _DataTerms,
     prior: _TwistPrior,
-) -> tuple[BodyState, CameraCorrections, Array]:
-    """One Gauss-Newton step; returns the new state, corrections and the normal matrix."""
+) -> tuple[BodyState, CameraCorrections]:
+    """One Gauss-Newton step."""
     parts = model.part_count
     active = min(stage.components, model.beta_count)
     _, derivative = body.jacobian(state, active)
@@ -297,4 +290,4 @@ def _step(
     )
     if extra:
         cameras = cameras.stepped(delta[size:].reshape(-1, 6))
-    return new, cameras, normal
+    return new, cameras

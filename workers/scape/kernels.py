@@ -1,13 +1,10 @@
-"""The one inner loop that numpy would pass over memory many times for: values and derivatives at
-every sample, in one pass (numba; each sample alone, so threads change nothing)."""
+"""The inner loops that numpy would pass over memory many times for (numba, one thread: the same
+input gives the same bits)."""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
-
-# The layer that every wheel of numba brings; a process runs one job, so one caller is enough.
-numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]  # set at run time
 
 
 @numba.njit(cache=True, fastmath=True)

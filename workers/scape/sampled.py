@@ -31,6 +31,8 @@ _SHAPE_FLOOR_M = 4e-5
 _TWIST_FLOOR_M = 1.5e-4
 """The same for a radian of a relative twist."""
 _SOLVED_AT_ONCE = 192
+_LAYOUT = 1
+"""Of the cached arrays: another one is built anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,8 @@ class SampledBody:
     def build(cls, model: BodyModel, indices: NDArray[np.integer[Any]]) -> SampledBody:
         """The model at vertices (n,); kept in the user's cache folder."""
         chosen = np.asarray(indices, dtype=np.int64)
-        key = hashlib.sha256(model.sha256.encode() + chosen.tobytes()).hexdigest()
+        made_by = f"{_LAYOUT} {_SHAPE_FLOOR_M} {_TWIST_FLOOR_M} {model.sha256}"
+        key = hashlib.sha256(made_by.encode() + chosen.tobytes()).hexdigest()
         arrays = cached_arrays(f"samples-{key[:32]}", lambda: _blocks(model, chosen))
         return cls(model, chosen, model.part_of_vertex[chosen].astype(np.int32), **arrays)
 
