@@ -31,9 +31,9 @@ _OTHER_LAYOUT_PX = 6.0
 _CERTAIN_M = 0.0015
 """A lens has to be known so well, in 95 % of the image, at the working distance."""
 _BETTER = 0.9
+"""Held-out errors have to fall below this share of the factory's."""
 _OTHER_SENSOR = 0.03
 """A unit's focal length varies by less; colour and depth differ by more."""
-"""Held-out errors have to fall below this share of the factory's."""
 _SIZE_TOLERANCE = 0.02
 _HELD_OUT_EVERY = 3
 _FIXED = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST

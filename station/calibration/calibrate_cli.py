@@ -102,9 +102,8 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         context = click.get_current_context()
         if context.invoked_subcommand is not None:
             if any([config_path, recordings, yes, *kwargs.values()]):
-                raise click.UsageError(
-                    f"put options after the step: station calibrate {context.invoked_subcommand} ..."
-                )
+                step = context.invoked_subcommand
+                raise click.UsageError(f"put options after the step: station calibrate {step} ...")
             return None
         config = load_config(find_config(config_path))
         store = CalibrationStore(config.calibrate.folder, config.calibration)

@@ -140,3 +140,10 @@ def test_nobody_is_waited_for_unattended(capsys: pytest.CaptureFixture[str]) -> 
     assert not guide.another("Once more?")
     lines = capsys.readouterr().out.split("\n")
     assert lines == ["", "Ball", "  Wave it.", "  0 s", "  seen", ""]
+
+
+def test_an_option_before_the_step_is_not_dropped(config: Path) -> None:
+    """`station calibrate --new ball` used to begin nothing anew, without a word."""
+    result = CliRunner().invoke(calibrate, ["--config", str(config), "--new", "ball"])
+    assert result.exit_code == 2
+    assert "station calibrate ball" in result.output

@@ -5,6 +5,7 @@ import importlib.util
 import io
 import json
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 
@@ -19,7 +20,7 @@ from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
 from workers.measure.cli import measure
 from workers.measure.definitions import DEFINITIONS, Route, Section
-from workers.measure.intervals import ErrorModel, learned, shipped, sides_pooled
+from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
 from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state
 from workers.measure.tracing import trace_all
@@ -177,6 +178,12 @@ def test_standing_lines_lie_on_the_scanned_mesh(model: BodyModel) -> None:
     assert np.abs(path[:, 2] - waist[2]).max() < 0.03
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     assert ((path >= low) & (path <= high)).all()
+
+
+def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:
+    """A model learned anew was once shipped with the intervals of the one before."""
+    document = json.loads(files("workers.measure").joinpath(SHIPPED).read_text("utf-8"))
+    assert document["made_of"]["model_sha256"] == model.sha256
 
 
 def test_intervals_hold_what_they_promise() -> None:
