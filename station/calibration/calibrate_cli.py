@@ -32,6 +32,7 @@ from station.config import BoothConfig, find_config, load_config
 from station.errors import CalibrationError
 
 _SENSORS_S = 20.0
+_MOST_BOARDS = 20
 _IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
 
 
@@ -74,6 +75,11 @@ class _Booth:
                 "no calibration has been begun; station calibrate goes through all steps"
             )
         return Session.load(self.store.unfinished)
+
+    def walls(self) -> int:
+        """How many places of the board the calibration that is being done has."""
+        begun = (self.store.unfinished / SESSION_FILE).exists()
+        return self.session().wall_count if begun else 0
 
     def _check_radius(self, session: Session) -> None:
         radius_m = self.config.calibrate.ball_radius_m
@@ -200,11 +206,13 @@ def _rest(booth: _Booth, step: str) -> None:
 
 def _walls(booth: _Booth, asked: bool) -> None:
     """The flat board at as many places as the operator (or the recordings) likes."""
-    for place in range(20):
+    # Live, a further board is added to those that were seen; recordings have places of their own.
+    before = booth.walls() if booth.recordings is None else 0
+    for place in range(before, before + _MOST_BOARDS):
         if booth.recordings is not None:
             if not (booth.recordings / f"{WALL}-{place}").is_dir():
                 return
-        elif (asked or place) and not booth.guide.another(
+        elif (asked or place > before) and not booth.guide.another(
             "A flat board at several distances makes the depths better. Show it (once more)?"
         ):
             return
@@ -350,12 +358,12 @@ def board(
                 f"{one} and {other} see the board's corners {1e3 * off_m:.1f} mm apart "
                 "through the calibration in use"
             )
-    found = {}
+    found: dict[str, Lens | None] = {}
     for name, seen in views.items():
         report = judge_lens(session.cameras[name], seen, printed)
         booth.guide.say(report.words())
-        if report.lens is not None:
-            found[name] = Lens(report.lens.K.tolist(), report.lens.distortion.tolist())
+        lens = report.lens
+        found[name] = None if lens is None else Lens(lens.K.tolist(), lens.distortion.tolist())
     session.keep_lenses(found)
 
 

@@ -144,6 +144,10 @@ class Session:
             view.save(private_folder(self.folder / SCENE) / f"{camera}.npz")
         self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
 
+    @property
+    def wall_count(self) -> int:
+        return sum(name.startswith(WALL) for name in self.planes)
+
     def keep_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
         """A flat board at one place ("wall-0", "wall-1", ...)."""
         self._append({"step": place, "planes": [plane.to_json() for plane in planes]})
@@ -165,9 +169,12 @@ class Session:
         """Wave from the beginning: another radius, a ball that slipped."""
         self._append({"step": "forget-balls"})
 
-    def keep_lenses(self, lenses: Mapping[str, Lens]) -> None:
-        """Intrinsics that the board constrains better than the factory's."""
-        document = {n: {"K": s.K, "distortion": s.distortion} for n, s in lenses.items()}
+    def keep_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
+        """Intrinsics that the board constrains better than the factory's; None: the factory's."""
+        document = {
+            name: None if lens is None else {"K": lens.K, "distortion": lens.distortion}
+            for name, lens in lenses.items()
+        }
         self._append({"step": "board", "lenses": document})
 
     def _append(self, entry: dict[str, Any]) -> None:
@@ -216,7 +223,9 @@ class Session:
             setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
         elif step == "board":
             for name, lens in entry["lenses"].items():
-                self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
+                self.lenses.pop(str(name), None)
+                if lens is not None:
+                    self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
         else:
             self.planes[step] = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
 

@@ -50,12 +50,22 @@ class CalibrationStore:
         """All stored calibrations, oldest first."""
         if not self.folder.is_dir():
             return []
-        used = self.in_use.read_bytes() if self.in_use.exists() else None
         return [
-            Entry(path.parent.name, path.parent, Rig.load(path), in_use=path.read_bytes() == used)
+            Entry(folder.name, folder, Rig.load(folder / CALIBRATION), self._is_used(folder))
+            for folder in self._folders()
+        ]
+
+    def _folders(self) -> list[Path]:
+        return [
+            path.parent
             for path in sorted(self.folder.glob(f"*/{CALIBRATION}"))
             if not path.parent.name.startswith((UNFINISHED, _ABANDONED, "."))
         ]
+
+    def _is_used(self, folder: Path) -> bool:
+        if not self.in_use.exists():
+            return False
+        return (folder / CALIBRATION).read_bytes() == self.in_use.read_bytes()
 
     def finish(self, rig: Rig, report: dict[str, Any]) -> Entry:
         """Give the unfinished calibration its date and put it beside the others.
@@ -91,15 +101,16 @@ class CalibrationStore:
         Raises:
             CalibrationError: there is none of that name; names those that there are.
         """
-        entries = self.entries()
-        found = next((entry for entry in entries if entry.name == name), None)
-        if found is None:
-            known = ", ".join(entry.name for entry in entries) or "none"
+        # A damaged one must not stand in the way of the others.
+        folders = {folder.name: folder for folder in self._folders()}
+        if name not in folders:
+            known = ", ".join(folders) or "none"
             raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
-        if self.in_use.exists() and not any(entry.in_use for entry in entries):
+        rig = Rig.load(folders[name] / CALIBRATION)
+        if self.in_use.exists() and not any(map(self._is_used, folders.values())):
             self._adopt()
-        write_bytes(self.in_use, (found.folder / CALIBRATION).read_bytes())
-        return Entry(found.name, found.folder, found.rig, in_use=True)
+        write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
+        return Entry(name, folders[name], rig, in_use=True)
 
     def _adopt(self) -> None:
         """Keep the file in use, which is not one of ours, under the date that it bears."""
@@ -118,9 +129,9 @@ class CalibrationStore:
         Raises:
             FormatError: naming the file that cannot be read.
         """
-        for entry in self.entries():
-            if entry.in_use:
-                views = sorted((entry.folder / SCENE).glob("*.npz"))
+        for folder in self._folders():
+            if self._is_used(folder):
+                views = sorted((folder / SCENE).glob("*.npz"))
                 return {path.stem: StaticView.load(path) for path in views}
         return {}
 

@@ -51,7 +51,8 @@ class DriftWatch:
             content = self._store.in_use.read_bytes()
             if content == self._content:
                 return
-            self._content, self._references, self._views = content, {}, {}
+            self._references, self._views = {}, {}
             self._views = self._store.scene()
+            self._content = content
         except (BoothError, OSError) as error:
             self._log.warning("scans are not checked for moved cameras: %s", error)
