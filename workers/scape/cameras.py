@@ -61,20 +61,22 @@ class CameraCorrections:
         """The cloud where the corrections have it."""
         if not len(self):
             return cloud
-        turns = so3_exp(self.xi[cloud.camera, :3])
-        return replace(
-            cloud,
-            points=self.moved(cloud.points, cloud.camera),
-            normals=np.einsum("cij,cj->ci", turns, cloud.normals),
-        )
+        normals = np.empty_like(cloud.normals)
+        for index, turn in enumerate(so3_exp(self.xi[:, :3])):
+            mine = cloud.camera == index
+            normals[mine] = cloud.normals[mine] @ turn.T
+        return replace(cloud, points=self.moved(cloud.points, cloud.camera), normals=normals)
 
     def moved(self, points: Array, camera: Index) -> Array:
         """Points (n, 3) of cameras (n,) where the corrections have them."""
-        if not len(self):
+        if not self.xi.any():
             return points
-        xi = self.xi[camera]
-        turned = np.einsum("cij,cj->ci", so3_exp(xi[:, :3]), points - self.eyes[camera])
-        return np.asarray(self.eyes[camera] + turned + xi[:, 3:])
+        found = np.empty_like(points)
+        for index, turn in enumerate(so3_exp(self.xi[:, :3])):
+            mine = camera == index
+            eye = self.eyes[index]
+            found[mine] = (points[mine] - eye) @ turn.T + (eye + self.xi[index, 3:])
+        return found
 
     def shifts_m(self, cloud: PointCloud) -> dict[str, float]:
         """How far the corrections move each camera's points, in the middle of them."""
