@@ -24,7 +24,7 @@ LARGEST_RMS_M = 0.006
 """Of single detections, whose own noise is 1-2 mm."""
 LARGEST_MEAN_M = 0.0025
 """Of a camera's held-out detections together, where the noise averages out."""
-_LEAST = 15
+_LEAST = 6
 """Fewer comparisons prove nothing."""
 
 
