@@ -68,7 +68,7 @@ class BallDetection:
             "points": self.points,
             "radius_m": self.radius_m,
             "radius_sigma_m": self.radius_sigma_m,
-            "patches": [[float(f"{x:.7g}") for x in patch] for patch in self.patches.tolist()],
+            "patches": _rounded(self.patches),
         }
 
     @classmethod
@@ -109,7 +109,7 @@ class PlaneObservation:
             "camera": self.camera,
             "surface": self.surface,
             "points": self.points,
-            "patches": [[float(f"{x:.7g}") for x in patch] for patch in self.patches.tolist()],
+            "patches": _rounded(self.patches),
         }
 
     @classmethod
@@ -141,6 +141,11 @@ class Observations:
     front: Sequence[BallDetection] = field(default_factory=tuple)
     """Of the ball resting on the floor in front of the mark; gives the heading when there."""
     planes: Sequence[PlaneObservation] = field(default_factory=tuple)
+
+
+def _rounded(patches: Array) -> list[list[float]]:
+    """Seven digits, far finer than a reading."""
+    return [[float(f"{x:.7g}") for x in patch] for patch in patches.tolist()]
 
 
 def _numbers(values: Any, shape: tuple[int | None, ...]) -> Array:

@@ -8,12 +8,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-_SIGMA_COEFFICIENT = 1.425e-3
-"""Random error of a Kinect v1: sigma_z = c z^2 (Khoshelham & Elberink 2012)."""
+from station.calibration.sensor_noise import RANDOM_SIGMA, STEP
+
 _GATE_SIGMAS = 3.0
 _STRAY_READINGS = 2
-_STEP_COEFFICIENT = 1.0 / (8.0 * 585.0 * 0.075)
-"""Depth step of 1/8 px of disparity: z^2 / (8 f b)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +30,7 @@ class AveragedDepth:
 
 def random_sigma_m(depth_m: NDArray[np.floating]) -> NDArray[np.floating]:
     """Standard deviation of one reading at a depth."""
-    return np.asarray(_SIGMA_COEFFICIENT * np.square(depth_m))
+    return np.asarray(RANDOM_SIGMA * np.square(depth_m))
 
 
 def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
@@ -74,7 +72,7 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
                 continue
             median = np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])
             square = median * median
-            gate = _GATE_SIGMAS * _SIGMA_COEFFICIENT * square + _STEP_COEFFICIENT * square
+            gate = _GATE_SIGMAS * RANDOM_SIGMA * square + STEP * square
             total = np.float32(0.0)
             kept = 0
             early = np.float32(0.0)

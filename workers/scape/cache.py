@@ -42,5 +42,5 @@ def cached_arrays(key: str, build: Callable[[], Arrays]) -> Arrays:
             np.savez(stream, allow_pickle=False, **arrays)
         temporary.replace(path)
     except OSError:
-        pass
+        pass  # a folder that takes no files costs time at the next start, not this result
     return arrays

@@ -16,6 +16,7 @@ from workers.scape.correspondence import OrientedTree
 from workers.scape.kernels import trimmed_costs
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.sampled import SampledBody
+from workers.scape.spread import farthest_first
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def _hand(model: BodyModel, side: str) -> Hand:
     names = model.part_names
     parts = tuple(names.index(f"{part}_{side}") for part in ("hand", "thumb", "fingers"))
     mine = np.flatnonzero(np.isin(model.part_of_vertex, parts))
-    order = _spread_out(model.mean[mine], _SAMPLES)
+    order = farthest_first(model.mean[mine], _SAMPLES)
     columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])
     values, vectors = np.linalg.eigh(model.twist_covariance[np.ix_(columns, columns)])
     body = model.at(mine[order])
@@ -75,16 +76,6 @@ def _hand(model: BodyModel, side: str) -> Hand:
         mean=model.twist_mean[columns],
         spread=vectors * np.sqrt(np.maximum(values, 0.0)),
     )
-
-
-def _spread_out(points: Array, count: int) -> NDArray[np.intp]:
-    """Farthest-point order."""
-    chosen = np.zeros(count, np.intp)
-    distance = np.linalg.norm(points - points[0], axis=1)
-    for index in range(1, count):
-        chosen[index] = np.argmax(distance)
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[index]], axis=1))
-    return chosen
 
 
 def place_hands(

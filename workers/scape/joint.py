@@ -26,6 +26,7 @@ from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.rows import CameraTerms, Rows, floor_rows, outline_rows
 from workers.scape.sampled import SampledBody, twist_chain
+from workers.scape.spread import farthest_first
 
 Array = NDArray[np.float64]
 
@@ -92,17 +93,9 @@ class Sampling:
 def _spread(model: BodyModel) -> NDArray[np.int64]:
     """Farthest-point order on the mean body, started from a fixed vertex; the soles' and the
     face's folds count by area, so that neither takes all the samples."""
-    points = model.mean
-    areas = np.sqrt(vertex_areas(points, model.faces))
+    areas = np.sqrt(vertex_areas(model.mean, model.faces))
     reach = np.minimum(areas / np.median(areas), 1.0)
-    chosen = np.empty(_FINE, np.int64)
-    distance = np.full(len(points), np.inf)
-    current = int(model.landmarks["crown"])
-    for index in range(_FINE):
-        chosen[index] = current
-        np.minimum(distance, np.linalg.norm(points - points[current], axis=1), out=distance)
-        current = int(np.argmax(distance * reach))
-    return chosen
+    return farthest_first(model.mean, _FINE, start=model.landmarks["crown"], reach=reach)
 
 
 @dataclass(frozen=True, slots=True)
