@@ -14,6 +14,8 @@ import scipy.sparse as sp
 from cholespy import CholeskySolverD, MatrixType
 from numpy.typing import NDArray
 
+from workers.scape.kernels import area_vectors, edge_pulls, summed_at_corners
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
@@ -25,8 +27,7 @@ _COLUMNS_AT_ONCE = 16
 
 def triangle_areas(vertices: Array, faces: Faces) -> Array:
     """Areas (K,) in square metres."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return np.asarray(0.5 * np.linalg.norm(area_vectors(vertices, faces), axis=1))
 
 
 def vertex_areas(vertices: Array, faces: Faces) -> Array:
@@ -43,12 +44,7 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    corners = faces.ravel()
-    normals = np.stack(
-        [np.bincount(corners, weighted[:, i], minlength=len(vertices)) for i in range(3)], axis=1
-    )
+    normals = summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
@@ -116,3 +112,8 @@ class EdgeSolver:
     def vertices(self, edges_: Array) -> Array:
         """Vertices (P, 3) whose edges come nearest to (K, 3, 3), with vertex 0 at the origin."""
         return self.solve(self.incidence @ edges_.reshape(-1, 3))
+
+    def carried(self, surface: Array, matrices: Array) -> Array:
+        """Vertices (P, 3) whose edges come nearest to a surface's (P, 3), those of each triangle
+        multiplied by its matrix (K, 3, 3); vertex 0 at the origin."""
+        return self.solve(edge_pulls(surface, self.faces, matrices, self.triangle_weights))

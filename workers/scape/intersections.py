@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from workers.scape.crossings import crossing_pairs
 from workers.scape.deformation import Faces, vertex_normals
+from workers.scape.kernels import area_vectors
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
@@ -39,9 +40,9 @@ def self_intersections(vertices: Array, faces: Faces) -> int:
 def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
     """(K,): triangles that look away from where they look on a reference surface (P, 3), and from
     where their surroundings look."""
-    here = _area_vectors(vertices, faces)
+    here = area_vectors(vertices, faces)
     around = vertex_normals(vertices, faces)[faces].sum(axis=1)
-    there = _area_vectors(reference, faces)
+    there = area_vectors(reference, faces)
     return np.asarray(
         (np.einsum("ki,ki->k", here, there) <= 0.0) & (np.einsum("ki,ki->k", here, around) <= 0.0)
     )
@@ -123,8 +124,3 @@ def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
     linked = linked.tocsr()
     linked.eliminate_zeros()
     return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()
-
-
-def _area_vectors(vertices: Array, faces: Faces) -> Array:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))

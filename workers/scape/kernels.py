@@ -142,3 +142,56 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
             other += min(np.sqrt(back[s]), tried_cut)
         result[h] = total / len(cloud) + tried_share * other / count
     return result
+
+
+@numba.njit(cache=True)
+def area_vectors(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(K, 3): normals of triangles (K, 3), as long as twice their areas."""
+    out = np.empty((len(faces), 3))
+    for k in range(len(faces)):
+        a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
+        x1, y1, z1 = (
+            vertices[b, 0] - vertices[a, 0],
+            vertices[b, 1] - vertices[a, 1],
+            vertices[b, 2] - vertices[a, 2],
+        )
+        x2, y2, z2 = (
+            vertices[c, 0] - vertices[a, 0],
+            vertices[c, 1] - vertices[a, 1],
+            vertices[c, 2] - vertices[a, 2],
+        )
+        out[k, 0] = y1 * z2 - z1 * y2
+        out[k, 1] = z1 * x2 - x1 * z2
+        out[k, 2] = x1 * y2 - y1 * x2
+    return out
+
+
+@numba.njit(cache=True)
+def summed_at_corners(values, faces, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(count, 3): at each vertex, the sum of what the triangles around it have, (K, 3)."""
+    out = np.zeros((count, 3))
+    for k in range(len(faces)):
+        for corner in range(3):
+            vertex = faces[k, corner]
+            for i in range(3):
+                out[vertex, i] += values[k, i]
+    return out
+
+
+@numba.njit(cache=True)
+def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(P, 3): what the triangles' edges, each turned by its triangle's matrix (K, 3, 3) and
+    weighted (K,), pull at their vertices."""
+    out = np.zeros(vertices.shape)
+    for k in range(len(faces)):
+        matrix, weight = matrices[k], weights[k]
+        for corner in range(3):
+            tail, head = faces[k, corner], faces[k, (corner + 1) % 3]
+            x = vertices[head, 0] - vertices[tail, 0]
+            y = vertices[head, 1] - vertices[tail, 1]
+            z = vertices[head, 2] - vertices[tail, 2]
+            for i in range(3):
+                pull = weight * (matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z)
+                out[head, i] += pull
+                out[tail, i] -= pull
+    return out

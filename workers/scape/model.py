@@ -171,16 +171,14 @@ class BodyModel:
     def turned(self, surface: Array, rotations: Array, translation: Array) -> Array:
         """A neutral surface (P, 3) with its parts turned and its pelvis put in place."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        turned_edges = edges(surface, self.faces) @ np.swapaxes(blended, 1, 2)
-        found = self.solver.vertices(turned_edges)
+        found = self.solver.carried(surface, blended)
         return np.asarray(found - self.anchor @ found + translation)
 
     def unturned(self, vertices: Array, rotations: Array) -> Array:
         """The neutral surface (P, 3) of a posed one: the inverse of `turned`, its pelvis at the
         mean body's."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        back = edges(vertices, self.faces) @ _inverse_transposed(blended)
-        found = self.solver.vertices(back)
+        found = self.solver.carried(vertices, _inverse(blended))
         return np.asarray(found + self.anchor @ (self.mean - found))
 
     def repose(self, vertices: Array, state: BodyState, new_state: BodyState) -> Array:
@@ -235,11 +233,11 @@ class BodyModel:
         return SampledBody.build(self, indices)
 
 
-def _inverse_transposed(matrices: Array) -> Array:
+def _inverse(matrices: Array) -> Array:
     """Of 3x3 matrices (K, 3, 3), by their cofactors: much quicker than a general inverse."""
     a, b, c = (matrices[:, i] for i in range(3))
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    return np.asarray(cofactors / np.einsum("ki,ki->k", a, cofactors[:, 0])[:, None, None])
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+    return np.asarray(cofactors / np.einsum("ki,ki->k", a, cofactors[:, :, 0])[:, None, None])
 
 
 def save_model(path: Path, fields: dict[str, Any], metadata: dict[str, Any]) -> None:

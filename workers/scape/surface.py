@@ -20,6 +20,7 @@ from scipy.sparse.linalg import cg
 from station.depth import PointCloud
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_normals
+from workers.scape.kernels import area_vectors
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
@@ -142,13 +143,10 @@ def _stood_on_floor(model: BodyModel, vertices: Array) -> Array:
 def _hold(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
     """1 where a step keeps every triangle's side, less where it would flip one."""
     faces = model.faces
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    before = np.cross(b - a, c - a)
+    before = area_vectors(vertices, faces)
     factor = np.ones(len(vertices))
     for _ in range(4):
-        moved = vertices + (factor * step)[:, None] * normals
-        a, b, c = (moved[faces[:, i]] for i in range(3))
-        after = np.cross(b - a, c - a)
+        after = area_vectors(vertices + (factor * step)[:, None] * normals, faces)
         flipped = np.einsum("ki,ki->k", before, after) <= 0.1 * np.einsum(
             "ki,ki->k", before, before
         )
