@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from workers.scape.deformation import Faces, neighbours
+from workers.scape.kernels import descend
+
 Array = NDArray[np.float64]
 
 _DIRECTION_SCALE_M = 0.04
@@ -53,6 +56,47 @@ class OrientedTree:
             max_angle_rad=max_angle_rad,
         )
         return found[kept], index[kept]
+
+
+class Followers:
+    """Oriented points (n, 3) that keep their vertex while one surface moves beneath them.
+
+    Each looks for a nearer one among the neighbours of its last, and on from there. Who finds none
+    within the limits, or had none, is searched for in the whole surface.
+    """
+
+    def __init__(self, faces: Faces, points: Array, normals: Array) -> None:
+        self.points, self.normals = points, normals
+        self._place = _joined(points, normals)
+        self._graph = neighbours(faces)
+        self._vertex = np.full(len(points), -1, np.intp)
+
+    def pairs(
+        self, vertices: Array, normals: Array, *, max_distance_m: float, max_angle_rad: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Those of the points that have a compatible vertex (P, 3), and which."""
+        limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
+        known = np.flatnonzero(self._vertex >= 0)
+        vertex = descend(
+            self._place[known], _joined(vertices, normals), *self._graph, self._vertex[known]
+        )
+        kept = compatible(
+            vertices[vertex] - self.points[known],
+            self.normals[known],
+            normals[vertex],
+            **limits,
+        )
+        found = np.full(len(self.points), -1, np.intp)
+        found[known[kept]] = vertex[kept]
+        lost = np.flatnonzero(found < 0)
+        if len(lost):
+            again, vertex = OrientedTree.build(vertices, normals).pairs(
+                self.points[lost], self.normals[lost], **limits
+            )
+            found[lost[again]] = vertex
+        self._vertex = found
+        used = np.flatnonzero(found >= 0)
+        return used, found[used]
 
 
 def _joined(points: Array, normals: Array) -> Array:

@@ -48,6 +48,14 @@ def vertex_normals(vertices: Array, faces: Faces) -> Array:
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
+def neighbours(faces: Faces) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices joined by an edge: where each one's begin (P + 1,), and all of them."""
+    tail = np.concatenate([faces.ravel(), np.roll(faces, -1, axis=1).ravel()])
+    head = np.concatenate([np.roll(faces, -1, axis=1).ravel(), faces.ravel()])
+    graph = sp.csr_matrix((np.ones(len(tail), bool), (tail, head)))
+    return graph.indptr, graph.indices
+
+
 def edges(vertices: Array, faces: Faces) -> Array:
     """The three edges of every triangle, (K, 3, 3): triangle, edge, coordinate."""
     corners = vertices[faces]

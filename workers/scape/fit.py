@@ -109,7 +109,7 @@ def _fit(
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
-    scout, _ = sampling.stage(_SCOUT_SAMPLES)
+    scout = sampling.body.first(_SCOUT_SAMPLES)
     target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
     starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
     if observer is not unobserved:

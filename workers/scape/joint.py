@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
 from workers.scape.cameras import CameraCorrections
-from workers.scape.correspondence import OrientedTree
+from workers.scape.correspondence import Followers, OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.free_space import FreeSpace
 from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
-from workers.scape.rows import CameraTerms, Rows, floor_rows, outline_rows
+from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
 from workers.scape.sampled import SampledBody, twist_chain
 from workers.scape.spread import farthest_first
 
@@ -36,6 +36,8 @@ _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
 _COARSE, _FINE = 600, 2000
 _PULLED_POINTS = 10_000
+_COARSELY_PULLED = 3
+"""While the fit is coarse, every so many of them."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -54,6 +56,11 @@ class Stage:
     """What one row counts: neighbours share what the model cannot express. Low at first, so that
     the prior carries the face and the hands as they are to where they belong."""
 
+    @property
+    def coarse(self) -> bool:
+        """Whether samples stand for the whole skin."""
+        return self.samples == _COARSE
+
 
 COARSE = (
     *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
@@ -69,25 +76,52 @@ class Sampling:
     """Nested sample vertices with the model's derivatives, and who stands for whom."""
 
     body: SampledBody
-    coarse_of_vertex: NDArray[np.intp]
-    fine_of_vertex: NDArray[np.intp]
+    normals: Array
+    """(n, 3): of the samples, on the mean body."""
+    share: Array
+    """(n,): the area that each sample stands for, in those of an average vertex."""
+    coarse_of_sample: NDArray[np.intp]
+    sample_of_vertex: NDArray[np.intp]
     hands: tuple[Hand, ...]
 
     @classmethod
     def build(cls, model: BodyModel) -> Sampling:
         """Samples spread evenly; the first ones alone are spread evenly too."""
         order = _spread(model)
+        places = model.mean[order]
+        sample_of_vertex = cKDTree(places).query(model.mean)[1]
         return cls(
             model.at(order),
-            cKDTree(model.mean[order[:_COARSE]]).query(model.mean)[1],
-            cKDTree(model.mean[order]).query(model.mean)[1],
+            vertex_normals(model.mean, model.faces)[order],
+            np.bincount(sample_of_vertex, model.vertex_shares, len(order)),
+            cKDTree(places[:_COARSE]).query(places)[1],
+            sample_of_vertex,
             hands_of(model),
         )
 
-    def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
-        if count == _FINE:
-            return self.body, self.fine_of_vertex
-        return self.body.first(count), self.coarse_of_vertex
+    def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
+        """The samples as the skin, their normals turned with the parts."""
+        index = self.body.indices
+        turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
+        normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
+        return Skin(
+            self.body.evaluate(state),
+            normals / np.linalg.norm(normals, axis=1, keepdims=True),
+            model.part_of_vertex[index],
+            self.share,
+            self.coarse_of_sample,
+        )
+
+    def skin(self, model: BodyModel, state: BodyState) -> Skin:
+        """Every vertex."""
+        vertices = model.vertices(state)
+        return Skin(
+            vertices,
+            vertex_normals(vertices, model.faces),
+            model.part_of_vertex,
+            model.vertex_shares,
+            self.sample_of_vertex,
+        )
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
@@ -152,13 +186,13 @@ def fit_jointly(
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
+    pulled = target.pulled
+    followers = Followers(model.faces, target.tree.points[pulled], target.tree.normals[pulled])
     terms: _DataTerms | None = None
     for step, stage in enumerate(schedule):
-        body, sample_of_vertex = sampling.stage(stage.samples)
-        vertices = model.vertices(state)
-        terms = _data_terms(
-            model, target, cameras, vertices, stage, sample_of_vertex, len(body.indices), observer
-        )
+        body = sampling.body.first(stage.samples)
+        skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
+        terms = _data_terms(model, target, followers, cameras, skin, stage, observer)
         state, cameras = _step(model, body, state, cameras, stage, terms, prior)
         progress((step + 1) / len(schedule))
     assert terms is not None
@@ -179,43 +213,47 @@ class _DataTerms:
 def _data_terms(
     model: BodyModel,
     target: Target,
+    followers: Followers,
     cameras: CameraCorrections,
-    vertices: Array,
+    skin: Skin,
     stage: Stage,
-    sample_of_vertex: NDArray[np.intp],
-    samples: int,
     observer: Observer,
 ) -> _DataTerms:
     """Correspondences, floor and outlines, summed up at the samples."""
-    normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
-    pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
     limits = {"max_distance_m": stage.gate_m, "max_angle_rad": stage.angle_rad}
-    body = OrientedTree.build(vertices, normals)
-    asking, mine = body.pairs(cloud.points[pulled], cloud.normals[pulled], **limits)
-    probes = np.arange(0, len(vertices), max(1, len(vertices) // (2 * stage.samples)))
-    probing, found = cloud.pairs(vertices[probes], normals[probes], **limits)
-    vertex = np.concatenate([mine, probes[probing]])
+    if stage.coarse:
+        pulled = target.pulled[::_COARSELY_PULLED]
+        asking, mine = OrientedTree.build(skin.positions, skin.normals).pairs(
+            cloud.points[pulled], cloud.normals[pulled], **limits
+        )
+    else:
+        pulled = target.pulled
+        asking, mine = followers.pairs(skin.positions, skin.normals, **limits)
+    probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
+    probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **limits)
+    place = np.concatenate([mine, probes[probing]])
     point = np.concatenate([pulled[asking], found])
-    on_body, camera = vertices[vertex], target.camera[point]
+    on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
-    observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
-    direction = normals[vertex]
+    seen = {"vertices": skin.positions, "on_body": on_body, "on_cloud": on_cloud}
+    observer("correspondences", seen)
+    direction = skin.normals[place]
     residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    pairs = Rows(vertex, direction, residual, stage.row_share * robust / variance)
-    rows = [pairs, floor_rows(model, vertices, normals, max(0.012, 0.5 * stage.gate_m))]
+    pairs = Rows(place, direction, residual, stage.row_share * robust / variance)
+    rows = [pairs, floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))]
     camera_terms = None
-    if stage.samples != _COARSE:
-        rows.append(outline_rows(model, target.free_space, vertices, stage.row_share))
+    if not stage.coarse:
+        rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(
-                pairs, derivative, camera, len(cameras), sample_of_vertex, samples
+                pairs, derivative, camera, len(cameras), skin, stage.samples
             )
-    weight, pull = Rows.joined(*rows).at_samples(sample_of_vertex, samples)
-    return _DataTerms(weight, pull, camera_terms, len(vertex))
+    weight, pull = Rows.joined(*rows).at_samples(skin, stage.samples)
+    return _DataTerms(weight, pull, camera_terms, len(place))
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +293,11 @@ def _step(
     rows = derivative.reshape(-1, size)
     extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
-    weighted = terms.weight.astype(np.float32) @ derivative
-    normal[:size, :size] = rows.T @ weighted.reshape(-1, size)
+    # Half of the weights goes to either side: numpy then computes one triangle of the product.
+    slack = 1e-9 * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + 1e-12
+    half = np.linalg.cholesky(terms.weight + slack * np.eye(3)).astype(np.float32)
+    weighted = (half.transpose(0, 2, 1) @ derivative).reshape(-1, size)
+    normal[:size, :size] = weighted.T @ weighted
     gradient[:size] = terms.pull.ravel().astype(np.float32) @ rows
     shape = slice(3 * parts, 3 * parts + active)
     normal[shape, shape] += np.eye(active)

@@ -195,3 +195,36 @@ def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-d
                 out[head, i] += pull
                 out[tail, i] -= pull
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def descend(points, nodes, first, neighbours, start):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(m,): for each point, the node of a graph that no neighbour beats, reached downhill.
+
+    Args:
+        points: (m, k).
+        nodes: (n, k).
+        first: (n + 1,): where each node's neighbours begin.
+        neighbours: (e,).
+        start: (m,): the node that each point sets out from.
+    """
+    size = points.shape[1]
+    out = np.empty(len(points), np.int64)
+    for p in range(len(points)):
+        here = start[p]
+        least = 0.0
+        for k in range(size):
+            least += (points[p, k] - nodes[here, k]) ** 2
+        moved = True
+        while moved:
+            moved = False
+            origin = here
+            for index in range(first[origin], first[origin + 1]):
+                there = neighbours[index]
+                square = 0.0
+                for k in range(size):
+                    square += (points[p, k] - nodes[there, k]) ** 2
+                if square < least:
+                    least, here, moved = square, there, True
+        out[p] = here
+    return out

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import cg
 
 from station.depth import PointCloud
-from workers.scape.correspondence import OrientedTree
+from workers.scape.correspondence import Followers
 from workers.scape.deformation import vertex_normals
 from workers.scape.kernels import area_vectors
 from workers.scape.model import BodyModel
@@ -59,7 +59,8 @@ class SurfaceFit:
 def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
+    followers = Followers(model.faces, cloud.points[every], cloud.normals[every])
+    noise = cloud.sigma_m[every]
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
@@ -67,7 +68,7 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     residual = np.zeros(len(vertices))
     for gate_m, angle_rad, stiffness in _ROUNDS:
         normals = vertex_normals(current, model.faces)
-        residual, weight = _gathered(current, normals, points, directions, noise, gate_m, angle_rad)
+        residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
         matrix = sp.diags(weight) + bending * (laplacian + _FADE * identity)
         step, _ = cg(
@@ -77,7 +78,7 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
         current = current + step[:, None] * normals
     current = _stood_on_floor(model, current)
     normals = vertex_normals(current, model.faces)
-    residual, weight = _gathered(current, normals, points, directions, noise, *_ROUNDS[-1][:2])
+    residual, weight = _gathered(current, normals, followers, noise, *_ROUNDS[-1][:2])
     # A vertex between others that have points is seen as well: the template is finer than pixels.
     seen = (abs(laplacian) @ weight) > 0
     return SurfaceFit(
@@ -98,8 +99,7 @@ def _membrane(model: BodyModel) -> sp.csr_matrix:
 def _gathered(
     vertices: Array,
     normals: Array,
-    points: Array,
-    directions: Array,
+    followers: Followers,
     sigma_m: Array,
     gate_m: float,
     angle_rad: float,
@@ -112,9 +112,10 @@ def _gathered(
     the polygon through them is short already; along the points' own normals it puts them as far
     outside as the polygon's girth needs to be that of the curve, to second order.
     """
-    used, vertex = OrientedTree.build(vertices, normals).pairs(
-        points, directions, max_distance_m=gate_m, max_angle_rad=angle_rad
+    used, vertex = followers.pairs(
+        vertices, normals, max_distance_m=gate_m, max_angle_rad=angle_rad
     )
+    points, directions = followers.points, followers.normals
     distance = np.einsum("ni,ni->n", directions[used], points[used] - vertices[vertex])
     information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
