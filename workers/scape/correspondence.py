@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 
 _DIRECTION_SCALE_M = 0.04
 """How far apart two points count that face opposite ways: half of twice this."""
+_SCOUT_EVERY = 4
+_WORTH_A_THREAD = 5000
+"""Fewer questions are answered before a second thread has started."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +34,7 @@ class OrientedTree:
 
     def nearest(self, points: Array, normals: Array) -> NDArray[np.intp]:
         """Index (m,) of the neighbour of each oriented point (m, 3)."""
-        _, index = self.tree.query(_joined(points, normals), workers=2)
+        _, index = self.tree.query(_joined(points, normals), workers=_threads(len(points)))
         return np.asarray(index)
 
     def pairs(
@@ -44,7 +47,9 @@ class OrientedTree:
         turn_m = 2.0 * _DIRECTION_SCALE_M * np.sin(0.5 * max_angle_rad)
         reach_m = float(np.hypot(max_distance_m, turn_m))
         _, index = self.tree.query(
-            _joined(points, normals), distance_upper_bound=reach_m, workers=2
+            _joined(points, normals),
+            distance_upper_bound=reach_m,
+            workers=_threads(len(points)),
         )
         found = np.flatnonzero(index < len(self.points))
         index = index[found]
@@ -62,11 +67,13 @@ class Followers:
     """Oriented points (n, 3) that keep their vertex while one surface moves beneath them.
 
     Each looks for a nearer one among the neighbours of its last, and on from there. Who finds none
-    within the limits, or had none, is searched for in the whole surface.
+    within the limits, or had none, is searched for in the whole surface. Dense points in the order
+    of an image set out from the vertex that was found for one a few places before them.
     """
 
-    def __init__(self, faces: Faces, points: Array, normals: Array) -> None:
+    def __init__(self, faces: Faces, points: Array, normals: Array, *, dense: bool = False) -> None:
         self.points, self.normals = points, normals
+        self._scouts = _SCOUT_EVERY if dense else 1
         self._place = _joined(points, normals)
         self._graph = neighbours(faces)
         self._vertex = np.full(len(points), -1, np.intp)
@@ -76,6 +83,10 @@ class Followers:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Those of the points that have a compatible vertex (P, 3), and which."""
         limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
+        tree: OrientedTree | None = None
+        if (self._vertex < 0).all():
+            tree = OrientedTree.build(vertices, normals)
+            self._send_scouts(tree, limits)
         known = np.flatnonzero(self._vertex >= 0)
         vertex = descend(
             self._place[known], _joined(vertices, normals), *self._graph, self._vertex[known]
@@ -90,13 +101,23 @@ class Followers:
         found[known[kept]] = vertex[kept]
         lost = np.flatnonzero(found < 0)
         if len(lost):
-            again, vertex = OrientedTree.build(vertices, normals).pairs(
-                self.points[lost], self.normals[lost], **limits
-            )
+            tree = tree or OrientedTree.build(vertices, normals)
+            again, vertex = tree.pairs(self.points[lost], self.normals[lost], **limits)
             found[lost[again]] = vertex
         self._vertex = found
         used = np.flatnonzero(found >= 0)
         return used, found[used]
+
+    def _send_scouts(self, tree: OrientedTree, limits: dict[str, float]) -> None:
+        every = slice(None, None, self._scouts)
+        found, vertex = tree.pairs(self.points[every], self.normals[every], **limits)
+        scouted = np.full(-(-len(self.points) // self._scouts), -1, np.intp)
+        scouted[found] = vertex
+        self._vertex = np.repeat(scouted, self._scouts)[: len(self.points)]
+
+
+def _threads(questions: int) -> int:
+    return 2 if questions > _WORTH_A_THREAD else 1
 
 
 def _joined(points: Array, normals: Array) -> Array:

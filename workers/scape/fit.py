@@ -46,7 +46,7 @@ Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
-_TREE_POINTS = 60_000
+_TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4

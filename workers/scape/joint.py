@@ -93,7 +93,7 @@ class Sampling:
         return cls(
             model.at(order),
             vertex_normals(model.mean, model.faces)[order],
-            np.bincount(sample_of_vertex, model.vertex_shares, len(order)),
+            np.bincount(sample_of_vertex, model.vertex_shares, len(order)).astype(np.float64),
             cKDTree(places[:_COARSE]).query(places)[1],
             sample_of_vertex,
             hands_of(model),

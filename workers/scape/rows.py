@@ -17,6 +17,8 @@ _FLOOR_SHARE = 0.02
 _SOLE_BAND_M = 0.003
 _FACING_DOWN = -0.8
 _OUTLINE_SIGMA_M = 0.004
+_OUTLINE_EVERY = 3
+"""Neighbours see the same pixels."""
 _SEARCHED = ("hand", "thumb", "fingers")
 """The search for the hands looks at points; one curl for four fingers cannot keep an outline."""
 
@@ -136,13 +138,14 @@ def floor_rows(model: BodyModel, skin: Skin, reach_m: float) -> Rows:
 
 def outline_rows(model: BodyModel, free_space: FreeSpace, skin: Skin, row_share: float) -> Rows:
     """Places go back from where a camera saw the booth behind them."""
-    found = free_space.intrusions(skin.positions)
+    found = free_space.intrusions(skin.positions[::_OUTLINE_EVERY])
+    place = _OUTLINE_EVERY * found.vertex
     searched = [i for i, name in enumerate(model.part_names) if name.startswith(_SEARCHED)]
-    kept = ~np.isin(skin.part[found.vertex], searched)
-    place = found.vertex[kept]
+    kept = ~np.isin(skin.part[place], searched)
+    place = place[kept]
     return Rows(
         place,
         found.direction[kept],
         -found.depth_m[kept],
-        row_share / _OUTLINE_SIGMA_M**2 * skin.share[place],
+        _OUTLINE_EVERY * row_share / _OUTLINE_SIGMA_M**2 * skin.share[place],
     )

@@ -59,7 +59,7 @@ class SurfaceFit:
 def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    followers = Followers(model.faces, cloud.points[every], cloud.normals[every])
+    followers = Followers(model.faces, cloud.points[every], cloud.normals[every], dense=True)
     noise = cloud.sigma_m[every]
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
