@@ -66,9 +66,9 @@ class OrientedTree:
 class Followers:
     """Oriented points (n, 3) that keep their vertex while one surface moves beneath them.
 
-    Each looks for a nearer one among the neighbours of its last, and on from there. Who finds none
-    within the limits, or had none, is searched for in the whole surface. Dense points in the order
-    of an image set out from the vertex that was found for one a few places before them.
+    They are searched for in the whole surface once. After that, each looks for a nearer vertex
+    among the neighbours of its last, and on from there. Dense points in the order of an image are
+    quicker: they set out from the vertex that was found for one a few places before them.
     """
 
     def __init__(self, faces: Faces, points: Array, normals: Array, *, dense: bool = False) -> None:
@@ -76,44 +76,41 @@ class Followers:
         self._scouts = _SCOUT_EVERY if dense else 1
         self._place = _joined(points, normals)
         self._graph = neighbours(faces)
-        self._vertex = np.full(len(points), -1, np.intp)
+        self._vertex: NDArray[np.intp] | None = None
 
     def pairs(
         self, vertices: Array, normals: Array, *, max_distance_m: float, max_angle_rad: float
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Those of the points that have a compatible vertex (P, 3), and which."""
         limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
-        tree: OrientedTree | None = None
-        if (self._vertex < 0).all():
+        last = self._vertex
+        if last is None:
             tree = OrientedTree.build(vertices, normals)
-            self._send_scouts(tree, limits)
-        known = np.flatnonzero(self._vertex >= 0)
-        vertex = descend(
-            self._place[known], _joined(vertices, normals), *self._graph, self._vertex[known]
-        )
+            last = self._scouted(tree, limits)
+        known = np.flatnonzero(last >= 0)
+        here = descend(self._place[known], _joined(vertices, normals), *self._graph, last[known])
         kept = compatible(
-            vertices[vertex] - self.points[known],
-            self.normals[known],
-            normals[vertex],
-            **limits,
+            vertices[here] - self.points[known], self.normals[known], normals[here], **limits
         )
         found = np.full(len(self.points), -1, np.intp)
-        found[known[kept]] = vertex[kept]
-        lost = np.flatnonzero(found < 0)
-        if len(lost):
-            tree = tree or OrientedTree.build(vertices, normals)
-            again, vertex = tree.pairs(self.points[lost], self.normals[lost], **limits)
-            found[lost[again]] = vertex
-        self._vertex = found
+        found[known[kept]] = here[kept]
+        last[known] = here
+        if self._vertex is None:
+            # Whom a scout led astray is searched for by itself.
+            lost = np.flatnonzero(found < 0)
+            again, anew = tree.pairs(self.points[lost], self.normals[lost], **limits)
+            found[lost[again]] = last[lost[again]] = anew
+            self._vertex = last
         used = np.flatnonzero(found >= 0)
         return used, found[used]
 
-    def _send_scouts(self, tree: OrientedTree, limits: dict[str, float]) -> None:
+    def _scouted(self, tree: OrientedTree, limits: dict[str, float]) -> NDArray[np.intp]:
+        """(n,): where each point sets out from, -1 where nothing was found."""
         every = slice(None, None, self._scouts)
         found, vertex = tree.pairs(self.points[every], self.normals[every], **limits)
         scouted = np.full(-(-len(self.points) // self._scouts), -1, np.intp)
         scouted[found] = vertex
-        self._vertex = np.repeat(scouted, self._scouts)[: len(self.points)]
+        return np.repeat(scouted, self._scouts)[: len(self.points)]
 
 
 def _threads(questions: int) -> int:

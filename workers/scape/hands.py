@@ -6,6 +6,7 @@ prior, against the points beyond the wrist; everything else of the body stays wh
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,11 +89,18 @@ def place_hands(
 ) -> BodyState:
     """The state with both hands turned and closed as the points beyond the wrists say."""
     tree = OrientedTree.build(vertices, normals)
-    for hand in hands:
+
+    def searched(hand: Hand) -> BodyState:
         points, directions = _beyond_wrist(model, hand, cloud, vertices, tree)
-        if len(points) >= _LEAST_POINTS:
-            state = _searched(model, hand, state, normals, points, directions)
-    return state
+        if len(points) < _LEAST_POINTS:
+            return state
+        return _searched(model, hand, state, normals, points, directions)
+
+    rotations = state.rotations.copy()
+    with ThreadPoolExecutor(max_workers=len(hands)) as pool:
+        for hand, found in zip(hands, pool.map(searched, hands), strict=True):
+            rotations[list(hand.parts)] = found.rotations[list(hand.parts)]
+    return replace(state, rotations=rotations)
 
 
 def _beyond_wrist(

@@ -8,6 +8,7 @@ share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ from workers.scape.sampled import SampledBody, twist_chain
 from workers.scape.spread import farthest_first
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 
 _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
@@ -60,6 +62,11 @@ class Stage:
     def coarse(self) -> bool:
         """Whether samples stand for the whole skin."""
         return self.samples == _COARSE
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Of the correspondences."""
+        return {"max_distance_m": self.gate_m, "max_angle_rad": self.angle_rad}
 
 
 COARSE = (
@@ -189,12 +196,17 @@ def fit_jointly(
     pulled = target.pulled
     followers = Followers(model.faces, target.tree.points[pulled], target.tree.normals[pulled])
     terms: _DataTerms | None = None
-    for step, stage in enumerate(schedule):
-        body = sampling.body.first(stage.samples)
-        skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
-        terms = _data_terms(model, target, followers, cameras, skin, stage, observer)
-        state, cameras = _step(model, body, state, cameras, stage, terms, prior)
-        progress((step + 1) / len(schedule))
+    with ThreadPoolExecutor(max_workers=1) as beside:
+        for step, stage in enumerate(schedule):
+            skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
+            # What the correspondences need not wait for is done beside them.
+            probed = beside.submit(_probed, target.tree, skin, stage)
+            derivative = beside.submit(
+                sampling.body.first(stage.samples).jacobian, state, stage.components
+            )
+            terms = _data_terms(model, target, followers, probed, cameras, skin, stage, observer)
+            state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
+            progress((step + 1) / len(schedule))
     assert terms is not None
     return JointResult(state, cameras, model.vertices(state), terms.correspondences, len(schedule))
 
@@ -210,10 +222,20 @@ class _DataTerms:
     correspondences: int
 
 
+def _probed(
+    cloud: OrientedTree, skin: Skin, stage: Stage
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Even places of the skin that have a point, and which."""
+    probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
+    probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **stage.limits)
+    return probes[probing], found
+
+
 def _data_terms(
     model: BodyModel,
     target: Target,
     followers: Followers,
+    probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
     cameras: CameraCorrections,
     skin: Skin,
     stage: Stage,
@@ -221,18 +243,16 @@ def _data_terms(
 ) -> _DataTerms:
     """Correspondences, floor and outlines, summed up at the samples."""
     cloud = target.tree
-    limits = {"max_distance_m": stage.gate_m, "max_angle_rad": stage.angle_rad}
     if stage.coarse:
         pulled = target.pulled[::_COARSELY_PULLED]
         asking, mine = OrientedTree.build(skin.positions, skin.normals).pairs(
-            cloud.points[pulled], cloud.normals[pulled], **limits
+            cloud.points[pulled], cloud.normals[pulled], **stage.limits
         )
     else:
         pulled = target.pulled
-        asking, mine = followers.pairs(skin.positions, skin.normals, **limits)
-    probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
-    probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **limits)
-    place = np.concatenate([mine, probes[probing]])
+        asking, mine = followers.pairs(skin.positions, skin.normals, **stage.limits)
+    probes, found = probed.result()
+    place = np.concatenate([mine, probes])
     point = np.concatenate([pulled[asking], found])
     on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
@@ -278,18 +298,16 @@ class _TwistPrior:
 
 def _step(
     model: BodyModel,
-    body: SampledBody,
     state: BodyState,
     cameras: CameraCorrections,
-    stage: Stage,
+    derivative: Array32,
     terms: _DataTerms,
     prior: _TwistPrior,
 ) -> tuple[BodyState, CameraCorrections]:
-    """One Gauss-Newton step."""
+    """One Gauss-Newton step; derivative is that of the samples, (n, 3, D)."""
     parts = model.part_count
-    active = min(stage.components, model.beta_count)
-    _, derivative = body.jacobian(state, active)
     size = derivative.shape[2]
+    active = size - 3 * parts - 3
     rows = derivative.reshape(-1, size)
     extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)

@@ -15,12 +15,11 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import cg
 
 from station.depth import PointCloud
 from workers.scape.correspondence import Followers
 from workers.scape.deformation import vertex_normals
-from workers.scape.kernels import area_vectors
+from workers.scape.kernels import area_vectors, conjugate_gradients
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
@@ -70,9 +69,9 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
         normals = vertex_normals(current, model.faces)
         residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
-        matrix = sp.diags(weight) + bending * (laplacian + _FADE * identity)
-        step, _ = cg(
-            matrix, weight * residual, rtol=1e-4, maxiter=250, M=sp.diags(1.0 / matrix.diagonal())
+        matrix = (sp.diags(weight) + bending * (laplacian + _FADE * identity)).tocsr()
+        step = conjugate_gradients(
+            matrix.indptr, matrix.indices, matrix.data, weight * residual, 1e-4, 250
         )
         step *= _hold(model, current, normals, step)
         current = current + step[:, None] * normals
