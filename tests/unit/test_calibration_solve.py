@@ -95,6 +95,13 @@ def test_the_mark_is_the_origin_and_the_floor_is_zero(
     assert solution.placed.mark_height_m == pytest.approx(0.1, abs=2e-3)
 
 
+def test_a_sound_booth_has_sound_clocks() -> None:
+    """Depth errors that are not yet corrected were taken for a clock that jumped by 90 ms."""
+    procedure = VirtualProcedure(synthetic.booth(10))
+    seen = synthetic.observations(procedure)
+    assert solved(procedure.booth.rig, seen).held_out
+
+
 def test_the_heading_comes_from_the_front_cameras_without_a_second_place(
     procedure: VirtualProcedure, seen: Observations
 ) -> None:
