@@ -168,7 +168,9 @@ class Layout:
             # The reference's missing pose and clock point before its start, and are left out.
             starts[name] = size - (_FOOT if name == problem.reference else 0)
             size += _CAMERA - (_FOOT if name == problem.reference else 0)
-        for name in (*problem.resting, *dict.fromkeys(s.surface for s in problem.surfaces)):
+        # A floor that no camera sees is known by the places where the ball rests on it.
+        surfaces = dict.fromkeys((FLOOR, *(seen.surface for seen in problem.surfaces)))
+        for name in (*problem.resting, *surfaces):
             starts[name] = size
             size += 3
         return cls(starts, size, problem.reference)
@@ -273,9 +275,8 @@ class _Equations:
                 self._add_resting(place, seen, problem, layout, state)
         for surface in problem.surfaces:
             self._add_surface(surface, layout, state)
-        if FLOOR in state.planes:
-            for place in problem.resting:
-                self._add_contact(place, problem.radius_m, layout, state)
+        for place in problem.resting:
+            self._add_contact(place, problem.radius_m, layout, state)
 
     def solve(self) -> tuple[Array, Array]:
         """Steps of the border (m,) and of the path (count, 3)."""

@@ -100,6 +100,7 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     view = static_view([np.full((480, 640), 20000, np.uint16)] * 2, 1e-4)
     session.keep_empty({"front-lower": view}, [floor])
     session.keep_resting(MARK, [_ball("front-lower", 5.0)])
+    session.keep_resting("around-0", [_ball("front-lower", 9.0)])
     session.begin_run()
     session.keep_balls([_ball("front-lower", 100.0), _ball("front-upper", 100.01)])
     session.begin_run()
@@ -119,6 +120,7 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert observations.balls[2].time_s - observations.balls[1].time_s == pytest.approx(10.0)
     assert observations.balls[1].time_s - observations.balls[0].time_s == pytest.approx(0.01)
     assert len(observations.mark) == len(observations.planes) == 1
+    assert [ball.time_s for ball in observations.around["around-0"]] == [9.0]
     assert again.lensed_cameras()["front-upper"].K[0, 0] == 600.0
     assert again.lensed_cameras()["front-lower"].K[0, 0] == 585.0
     assert again.background("front-lower") is not None
