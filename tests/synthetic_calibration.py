@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from station.calibration import depth_correction
 from station.calibration.detections import FLOOR, BallDetection, Observations, PlaneObservation
-from station.calibration.joint import Sightings, ball_inverse_depth, local_equations
+from station.calibration.joint import ball_inverse_depth, local_equations
+from station.calibration.problem import Sightings
 from station.calibration.rig import CameraCalibration, Rig
 from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
 from station.drivers.virtual import FRAME_RATE_HZ, SimulatedBooth, SimulatedUnit

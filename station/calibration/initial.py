@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from station.calibration import depth_correction
 from station.calibration.detections import FLOOR, BallDetection, PlaneObservation
-from station.calibration.joint import Problem, Sightings, State, Surface
 from station.calibration.pairwise import GATE_M, Track
+from station.calibration.problem import Problem, Sightings, State, Surface
 from station.calibration.rig import CameraCalibration
 from station.calibration.trajectory import TimeGrid
 from station.geometry import transform

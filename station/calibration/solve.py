@@ -27,8 +27,9 @@ from station.calibration.initial import (
     sorted_detections,
     spread_m,
 )
-from station.calibration.joint import Problem, Sightings, State, solve_joint
+from station.calibration.joint import solve_joint
 from station.calibration.pairwise import Pair, chain, relate_all
+from station.calibration.problem import Problem, Sightings, State
 from station.calibration.rig import CameraCalibration, Rig
 from station.calibration.world import Placed
 from station.errors import CalibrationError

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detections import FLOOR
-from station.calibration.joint import Layout, Problem, State, moved_state
+from station.calibration.problem import Layout, Problem, State, moved_state
 from station.geometry import invert, rigid, skew, so3_log
 
 Array = NDArray[np.float64]
