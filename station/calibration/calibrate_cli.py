@@ -131,7 +131,11 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         store = CalibrationStore(config.calibrate.folder, config.calibration)
         attended = not yes and recordings is None
         guide = Guide(attended, config.calibrate.countdown_s)
-        return command(_Booth(config, store, recordings, guide), *args, **kwargs)
+        booth = _Booth(config, store, recordings, guide)
+        if kwargs.get("list_them"):
+            return command(booth, *args, **kwargs)
+        with store.locked():
+            return command(booth, *args, **kwargs)
 
     return wrapped
 

@@ -86,6 +86,17 @@ def test_a_file_from_elsewhere_is_kept_when_another_is_put_into_use(
     assert store.scene() == {}
 
 
+def test_two_do_not_calibrate_at_once(store: CalibrationStore) -> None:
+    """Two runs once wrote into one journal, and both waved their own ball."""
+    other = CalibrationStore(store.folder, store.in_use)
+    with store.locked():
+        with pytest.raises(CalibrationError, match="another station calibrate"), other.locked():
+            pass
+        assert store.entries() == []
+    with other.locked():
+        pass
+
+
 def test_what_was_begun_is_set_aside_not_lost(store: CalibrationStore) -> None:
     assert store.set_aside() is None
     for number in (1, 2):
