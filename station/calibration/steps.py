@@ -165,7 +165,7 @@ def wave_ball(
     """
     coverage = covered(session, reference)
     session.begin_run()
-    resets = feed.clock_resets()
+    resets: dict[str, int] = {}
     waiting: list[BallDetection] = []
 
     def keep(balls: list[BallDetection]) -> None:
@@ -181,13 +181,16 @@ def wave_ball(
     with BallFinder(session, patient=feed.replays) as finder:
         try:
             while not feed.over:
-                finder.look(feed.newest())
+                for frame in feed.newest():
+                    if resets.setdefault(frame.camera, frame.clock_resets) != frame.clock_resets:
+                        # What follows cannot be put in time with what went before, of which some
+                        # is still being looked at.
+                        keep(finder.found(wait=True))
+                        write()
+                        session.begin_run()
+                        resets[frame.camera] = frame.clock_resets
+                    finder.look([frame])
                 keep(finder.found())
-                if feed.clock_resets() != resets:
-                    # What follows cannot be put in time with what went before.
-                    write()
-                    resets = feed.clock_resets()
-                    session.begin_run()
                 now_s = time.monotonic()
                 if now_s - written_s > _WRITE_EVERY_S:
                     write()
@@ -201,6 +204,8 @@ def wave_ball(
             guide.say("stopped; what was seen is kept")
         finally:
             write()
+    if feed.replays and feed.missed:
+        guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
     for name, (near, moments) in coverage.ties().items():
