@@ -16,7 +16,7 @@ from station.drivers.virtual import (
     SimulatedUnit,
     VirtualFrame,
 )
-from station.drivers.virtual_noise import TrueView, observe
+from station.drivers.virtual_noise import NoiselessView, TrueView, observe
 from station.drivers.virtual_round import Capsule, ball, overlay
 from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, box
 from station.errors import InputError
@@ -73,13 +73,14 @@ class VirtualProcedure:
         view = self._still(camera, step)
         # Behind what moves a short loop flickers on; only what moves is drawn anew each frame.
         moves = step in (BALL, MARK, FRONT) or step.startswith(AROUND)
-        loop = [observe(view, unit.error, rng) for _ in range(_STILL_FRAMES if moves else 0)]
+        still = NoiselessView.of(view, unit.error)
+        loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
         first = int(np.ceil((start_s - unit.phase_s) * FRAME_RATE_HZ))
         lasts_s = min(self._lasts_s(step), limit_s or np.inf)
         for sequence in range(first, first + int(lasts_s * FRAME_RATE_HZ), stride):
             time_s = unit.phase_s + sequence / FRAME_RATE_HZ
-            raw = loop[int(rng.integers(len(loop)))] if moves else observe(view, unit.error, rng)
+            raw = loop[int(rng.integers(len(loop)))] if moves else still.read(rng)
             drawn = overlay(view, calibration, self._moving(step, time_s))
             if drawn is not None:
                 part, window = drawn
