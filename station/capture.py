@@ -40,6 +40,7 @@ class CaptureProcess:
         self._driver: DepthDriver | None = None
         self._info: DeviceInfo | None = None
         self._clock: DeviceClock | None = None
+        self._past_resets = 0
         self._state, self._detail = "off", ""
         self._failures = 0
         self._open_at_s = 0.0
@@ -82,6 +83,9 @@ class CaptureProcess:
             self._failed(driver, error)
             return
         self._driver = driver
+        if self._clock is not None:
+            # A sensor that comes back may count from anywhere.
+            self._past_resets = self._clock_resets() + 1
         self._clock = DeviceClock(self._info.tick_hz, self._info.tick_bits)
         self._last_sequence = None
         self._tell_health(now=True)
@@ -117,8 +121,12 @@ class CaptureProcess:
             host_time_s=clock.host_time_s(frame.device_ticks, frame.host_time_s),
             received_s=frame.host_time_s,
             sequence=self._frames + self._lost,
+            clock_resets=self._clock_resets(),
         )
         self._out.send_multipart([self._topic, header.pack(), frame.depth.data], copy=False)
+
+    def _clock_resets(self) -> int:
+        return self._past_resets + (0 if self._clock is None else self._clock.resets)
 
     def _failed(self, driver: DepthDriver, error: DriverError) -> None:
         driver.close()
@@ -141,9 +149,8 @@ class CaptureProcess:
         if not now and moment - self._told_s < 1.0 / TOPICS["health"].rate_hz:
             return
         self._told_s = moment
-        resets = 0 if self._clock is None else self._clock.resets
         health = CameraHealth(
-            self._name, self._state, self._detail, self._frames, self._lost, resets
+            self._name, self._state, self._detail, self._frames, self._lost, self._clock_resets()
         )
         self._out.send_multipart([self._health_topic, health.pack()])
         if self._info is not None:

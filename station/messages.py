@@ -57,6 +57,8 @@ class Message:
 class FrameHeader(Message):
     """Precedes the raw bytes of one depth frame (uint16, row by row)."""
 
+    VERSION: ClassVar[int] = 2
+
     camera: str
     serial: str
     width: int
@@ -69,6 +71,8 @@ class FrameHeader(Message):
     received_s: float
     """When it reached the host, same clock."""
     sequence: int
+    clock_resets: int
+    """How often the sensor's clock was reset: times before and after have nothing in common."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from station.calibration import depth_correction
 from station.calibration.detections import FLOOR, BallDetection, Observations, PlaneObservation
-from station.calibration.joint import Sightings, ball_inverse_depth, local_equations
+from station.calibration.joint import ball_inverse_depth, local_equations
+from station.calibration.problem import Sightings
 from station.calibration.rig import CameraCalibration, Rig
 from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
 from station.drivers.virtual import FRAME_RATE_HZ, SimulatedBooth, SimulatedUnit
-from station.drivers.virtual_calibration import BALL, VirtualProcedure
+from station.drivers.virtual_calibration import AROUND, BALL, VirtualProcedure
 from station.drivers.virtual_scene import default_rig
 from station.geometry import invert, se3_exp, transform
 
@@ -54,6 +55,8 @@ def observations(
 ) -> Observations:
     """A whole calibration's detections."""
     waved, mark, front, planes = [], [], [], []
+    beside = [(f"{AROUND}-{i}", at) for i, at in enumerate(procedure.around_m)]
+    around: dict[str, list[BallDetection]] = {step: [] for step, _ in beside}
     start_s = procedure.starts_s(BALL)
     low = np.array([0.0, 0.0, procedure.radius_m])
     for index, (name, camera) in enumerate(procedure.booth.rig.cameras.items()):
@@ -65,11 +68,15 @@ def observations(
             seen = _ball(camera, unit, procedure.ball_center_m(time_s), procedure, rng)
             if seen is not None:
                 waved.append(replace(seen, time_s=float(time_s + late_s)))
-        for place, found in ((low, mark), (low - (0.0, procedure.front_m, 0.0), front)):
+        places = [(low, mark), (low - (0.0, procedure.front_m, 0.0), front)]
+        places += [(np.array([x, y, low[2]]), around[step]) for step, (x, y) in beside]
+        for place, found in places:
             seen = [_ball(camera, unit, place, procedure, rng) for _ in range(15)]
             found += [detection for detection in seen if detection is not None]
         planes.append(_floor(camera, unit, rng))
-    return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
+    return Observations(
+        waved, mark, front, [plane for plane in planes if plane is not None], around
+    )
 
 
 def _measured(
@@ -221,7 +228,12 @@ FAULTS = (
     Fault("another ball", lambda seen: seen, "the ball measures 100 mm in radius", 0.11),
     Fault("too short", lambda seen: _near(seen, 14.0), "camera "),
     Fault("nothing on the mark", lambda seen: replace(seen, mark=()), "on the mark"),
-    Fault("no floor", lambda seen: replace(seen, planes=()), "the floor"),
+    Fault("no floor", lambda seen: replace(seen, planes=(), around={}), "the floor"),
+    Fault(
+        "no floor, and the ball on one line",
+        lambda seen: replace(seen, planes=(), around={"around-2": seen.around["around-2"]}),
+        "away from one line",
+    ),
     Fault(
         "a clock reset by a second",
         lambda seen: _later(seen, "back-upper", 1.0),

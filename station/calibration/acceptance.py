@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.joint import Problem, Sightings, State, local_equations
+from station.calibration.joint import local_equations
 from station.calibration.pairwise import Track
+from station.calibration.problem import Problem, Sightings, State
 from station.geometry import transform
 
 Array = NDArray[np.float64]

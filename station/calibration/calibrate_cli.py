@@ -18,7 +18,16 @@ from station.calibration.board import Board, BoardView, check_ties, find_board, 
 from station.calibration.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide import Guide
 from station.calibration.rig import Rig
-from station.calibration.session import BALL, EMPTY, FRONT, MARK, WALL, Lens, Session
+from station.calibration.session import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    MARK,
+    WALL,
+    Lens,
+    Session,
+)
 from station.calibration.session import SESSION as SESSION_FILE
 from station.calibration.steps import (
     covered,
@@ -32,7 +41,9 @@ from station.config import BoothConfig, find_config, load_config
 from station.errors import CalibrationError
 
 _SENSORS_S = 20.0
-_MOST_BOARDS = 20
+_MOST_BOARDS, _MOST_PLACES = 20, 20
+_AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
+"""Where the ball is laid: three places away from one line show the floor's slope both ways."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
 
 
@@ -81,6 +92,11 @@ class _Booth:
         begun = (self.store.unfinished / SESSION_FILE).exists()
         return self.session().wall_count if begun else 0
 
+    def places(self) -> int:
+        """At how many places around the mark the ball has been laid."""
+        begun = (self.store.unfinished / SESSION_FILE).exists()
+        return len(self.session().around) if begun else 0
+
     def _check_radius(self, session: Session) -> None:
         radius_m = self.config.calibrate.ball_radius_m
         if session.radius_m != radius_m:
@@ -115,7 +131,11 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         store = CalibrationStore(config.calibrate.folder, config.calibration)
         attended = not yes and recordings is None
         guide = Guide(attended, config.calibrate.countdown_s)
-        return command(_Booth(config, store, recordings, guide), *args, **kwargs)
+        booth = _Booth(config, store, recordings, guide)
+        if kwargs.get("list_them"):
+            return command(booth, *args, **kwargs)
+        with store.locked():
+            return command(booth, *args, **kwargs)
 
     return wrapped
 
@@ -126,7 +146,7 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--new", is_flag=True, help="begin anew; what was seen so far is set aside")
 @_options
 def calibrate(booth: _Booth, use_name: str | None, list_them: bool, new: bool) -> None:
-    """Find where the cameras are: empty booth, a waved ball, the mark, then the solution.
+    """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
 
     Without a step all of them are done, guided, from where the last attempt ended. Every result is
     a dated folder; the previous ones are kept.
@@ -175,6 +195,8 @@ def _guided(booth: _Booth) -> None:
         _rest(booth, MARK)
     if booth.recordings is not None and (booth.recordings / FRONT).is_dir():
         _rest(booth, FRONT)
+    if session is None or len(session.around) < len(_AROUND):
+        _around(booth, asked=True)
     if session is None or not session.done(WALL):
         _walls(booth, asked=True)
     _solve(booth)
@@ -199,9 +221,29 @@ def _ball(booth: _Booth) -> None:
 
 def _rest(booth: _Booth, step: str) -> None:
     where = "on the mark" if step == MARK else "on the floor in front of the mark, 0.5 m away"
+    _lay(booth, step, where)
+
+
+def _lay(booth: _Booth, step: str, where: str) -> None:
     booth.guide.step(f"Ball {where}", f"Lay the ball {where} and step back.")
     with booth.feed(step) as (feed, session):
         rest_ball(feed, session, booth.guide, step)
+
+
+def _around(booth: _Booth, asked: bool) -> None:
+    """The ball on the floor beside and behind the mark; more places where they are wanted."""
+    before = booth.places() if booth.recordings is None else 0
+    for place in range(before, before + _MOST_PLACES):
+        step = f"{AROUND}-{place}"
+        if booth.recordings is not None:
+            if not (booth.recordings / step).is_dir():
+                return
+        elif place >= len(_AROUND) and (
+            asked or (place > before and not booth.guide.another("Lay it at one more place?"))
+        ):
+            return
+        where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
+        _lay(booth, step, f"on the floor {where}, 0.6 m away, where the lower cameras see it")
 
 
 def _walls(booth: _Booth, asked: bool) -> None:
@@ -290,6 +332,20 @@ def mark(booth: _Booth, front: bool) -> None:
       station calibrate mark --front
     """
     _rest(booth, FRONT if front else MARK)
+
+
+@calibrate.command("around")
+@_options
+def around(booth: _Booth) -> None:
+    """Look at the ball lying on the floor beside and behind the mark: the floor's slope.
+
+    Further places are added to those that were seen.
+
+    \b
+    Examples:
+      station calibrate around
+    """
+    _around(booth, asked=False)
 
 
 @calibrate.command("depth")

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 _WINDOW_S = 4.0
 _LEAST_IN_WINDOW = 8
 _LONGEST_SHIFT_S = 3.0
+_SHORTEST_SHIFT_S = 0.15
+"""In that time the ball goes farther than depth errors reach: shorter jumps are told from them only
+once these are corrected, by ``small_jump``."""
 _SHIFT_STEP_S = 0.03
 _ONE_JUMP_S = 0.15
 """Windows after one jump ask for the same shift to within this."""
@@ -106,7 +109,8 @@ def moved_camera(pairs: Mapping[tuple[str, str], Pair]) -> str | None:
 
 def _window_shifts(a: Track, b: Track, pair: Pair) -> list[float]:
     """By how much b's clock is late in each window in which the pair does not agree otherwise."""
-    shifts = np.arange(-_LONGEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
+    later = np.arange(_SHORTEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
+    shifts = np.concatenate([-later[::-1], later])
     found = []
     for start in np.arange(pair.times_s.min(), pair.times_s.max(), _WINDOW_S):
         inside = (pair.times_s >= start) & (pair.times_s < start + _WINDOW_S)

@@ -9,7 +9,7 @@ acts linearly, and a flat surface is linear in the pixel.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -141,6 +141,24 @@ class Observations:
     front: Sequence[BallDetection] = field(default_factory=tuple)
     """Of the ball resting on the floor in front of the mark; gives the heading when there."""
     planes: Sequence[PlaneObservation] = field(default_factory=tuple)
+    around: Mapping[str, Sequence[BallDetection]] = field(default_factory=dict)
+    """Of the ball resting on the floor elsewhere: name of the place -> detections."""
+
+    @classmethod
+    def merged(cls, parts: Iterable[Self]) -> Self:
+        """What several cameras saw of one calibration."""
+        listed = list(parts)
+        places = dict.fromkeys(place for part in listed for place in part.around)
+        return cls(
+            balls=[one for part in listed for one in part.balls],
+            mark=[one for part in listed for one in part.mark],
+            front=[one for part in listed for one in part.front],
+            planes=[one for part in listed for one in part.planes],
+            around={
+                place: [one for part in listed for one in part.around.get(place, ())]
+                for place in places
+            },
+        )
 
 
 def _rounded(patches: Array) -> list[list[float]]:

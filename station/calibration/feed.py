@@ -45,6 +45,8 @@ class TimedFrame:
     depth: NDArray[np.uint16]
     """(height, width) in units of scale_m, 0 = no reading."""
     scale_m: float
+    clock_resets: int = 0
+    """How often the camera's clock had been reset."""
 
     def depth_m(self) -> NDArray[np.float32]:
         return self.depth.astype(np.float32) * np.float32(self.scale_m)
@@ -65,6 +67,8 @@ class RecordedClock:
         self._clock: DeviceClock | None = None
         self.over = False
         """It has been seen once; from here on it starts over."""
+        self.missed = 0
+        """Frames of it that did not come, so far."""
 
     def time_s(self, header: FrameHeader) -> float | None:
         """When a frame was taken, or None where the recording has begun anew."""
@@ -75,9 +79,13 @@ class RecordedClock:
                 "is another station running on these recordings?"
             )
         index, seconds = found
-        if self.over or index <= self._last_index:
+        if self.over:
+            return None
+        if index <= self._last_index:
+            self.missed += self._last - self._last_index
             self.over = True
             return None
+        self.missed += index - self._last_index - 1
         if self._clock is None:
             self._clock = DeviceClock(header.tick_hz, 32)
         self._last_index = index
@@ -109,6 +117,7 @@ class Feed:
         self._seen_s: dict[str, float] = {}
         kept = _REPLAYED_FRAMES if clocks else _LIVE_FRAMES
         self._waiting: deque[TimedFrame] = deque(maxlen=kept)
+        self._overrun = 0
 
     def __enter__(self) -> Feed:
         return self
@@ -126,14 +135,10 @@ class Feed:
         """All recordings have been seen once; live cameras never end."""
         return bool(self._clocks) and all(clock.over for clock in self._clocks.values())
 
-    def clock_resets(self) -> dict[str, int]:
-        """How often each camera's clock was reset since its process began.
-
-        Replays have the clocks of their recordings, whatever becomes of the replay's.
-        """
-        if self._clocks:
-            return {}
-        return {name: health.clock_resets for name, health in self._health.items()}
+    @property
+    def missed(self) -> int:
+        """Frames of replayed recordings that came too fast to be taken."""
+        return self._overrun + sum(clock.missed for clock in self._clocks.values())
 
     def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
         """Every camera as it comes from the factory, once all of them give frames.
@@ -229,6 +234,7 @@ class Feed:
                 self._seen_s[header.camera] = time.monotonic()
                 frame = self._timed(header, body[0].buffer)
                 if frame is not None:
+                    self._overrun += len(self._waiting) == self._waiting.maxlen
                     self._waiting.append(frame)
 
     def _timed(self, header: FrameHeader, pixels: memoryview) -> TimedFrame | None:
@@ -237,7 +243,9 @@ class Feed:
         if time_s is None:
             return None
         depth = np.frombuffer(pixels, np.uint16).reshape(header.height, header.width)
-        return TimedFrame(header.camera, time_s, depth, header.depth_scale_m)
+        # Replays have the clocks of their recordings, whatever becomes of the replay's.
+        resets = header.clock_resets if clock is None else 0
+        return TimedFrame(header.camera, time_s, depth, header.depth_scale_m, resets)
 
     def _wish(self) -> None:
         """Capture processes of a replay have no control that tells them to stream."""

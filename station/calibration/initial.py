@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from station.calibration import depth_correction
 from station.calibration.detections import FLOOR, BallDetection, PlaneObservation
-from station.calibration.joint import Problem, Sightings, State, Surface
 from station.calibration.pairwise import GATE_M, Track
+from station.calibration.problem import Problem, Sightings, State, Surface
 from station.calibration.rig import CameraCalibration
 from station.calibration.trajectory import TimeGrid
 from station.geometry import transform
@@ -23,6 +23,8 @@ _RADIUS_SLACK = 0.03
 _RADIUS_SIGMAS = 4.0
 _LEAST_AT_REST = 5
 _REST_GATE_M = 0.02
+_THINNEST_PX = 12.0
+"""A narrower strip of a surface does not say how it leans."""
 _SAME_COSINE = np.cos(np.radians(4.0))
 _SAME_DISTANCE_M = 0.08
 """Within which planes may be one, before depth errors are corrected."""
@@ -105,6 +107,7 @@ def named_surfaces(
     Views that do not agree with the largest number of others are of something else.
     """
     found: list[Surface] = []
+    planes = [seen for seen in planes if np.ptp(seen.patches[:, :2], axis=0).min() > _THINNEST_PX]
     for surface in dict.fromkeys(seen.surface for seen in planes):
         views = [
             (seen, _facing(Surface.of(cameras[seen.camera], seen, surface), poses))
@@ -134,6 +137,32 @@ def _one_plane(view: tuple[Array, float], other: tuple[Array, float]) -> bool:
     return bool(view[0] @ other[0] > _SAME_COSINE and abs(view[1] - other[1]) < _SAME_DISTANCE_M)
 
 
+def resting_places(
+    resting: Mapping[str, Sequence[Sightings]], poses: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Where the ball rested (3,), reference frame: the mean of what the cameras saw."""
+    return {
+        place: np.mean(
+            [transform(poses[s.camera], s.centers.mean(axis=0)) for s in sightings], axis=0
+        )
+        for place, sightings in resting.items()
+    }
+
+
+def spread_m(centers: Array) -> float:
+    """How far resting balls (n, 3) lie from one line, rms: nothing shows a floor's slope else."""
+    away = centers - centers.mean(axis=0)
+    return float(np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(away))[1], 0.0)))
+
+
+def floor_below(centers: Array, radius_m: float) -> Array:
+    """q (3,) of the plane q . X = 1 that balls with centres (n, 3) lie on; the origin is above."""
+    middle = centers.mean(axis=0)
+    down = np.linalg.svd(centers - middle)[2][2]
+    down = down * np.sign(down @ middle)
+    return np.asarray(down / (down @ middle + radius_m))
+
+
 def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
     """Poses as the pairs gave them, no depth correction, the path through all detections."""
     times, points = [], []
@@ -143,17 +172,14 @@ def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
     every_time, every_point = np.concatenate(times), np.concatenate(points)
     grid = TimeGrid.over(every_time)
     controls = grid.fit(every_time, every_point, np.full(len(every_time), 1e6))
-    places = {
-        place: np.mean(
-            [transform(poses[s.camera], s.centers.mean(axis=0)) for s in sightings], axis=0
-        )
-        for place, sightings in problem.resting.items()
-    }
+    places = resting_places(problem.resting, poses)
     planes: dict[str, Array] = {}
     for surface in problem.surfaces:
         if surface.surface not in planes:
             normal, distance_m = _facing(surface, poses)
             planes[surface.surface] = normal / distance_m
+    if FLOOR not in planes:
+        planes[FLOOR] = floor_below(np.array(list(places.values())), problem.radius_m)
     return State(
         poses=dict(poses),
         clock_s=dict.fromkeys(problem.cameras, 0.0),

@@ -8,22 +8,29 @@ gives the exact step in milliseconds, and the border's covariance with the path 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from station.calibration import depth_correction
-from station.calibration.detections import FLOOR, BallDetection, PlaneObservation
-from station.calibration.rig import CameraCalibration
-from station.calibration.trajectory import TimeGrid, along
-from station.geometry import se3_exp, skew
+from station.calibration.detections import FLOOR
+from station.calibration.problem import (
+    FOOT,
+    PER_CAMERA,
+    Indices,
+    Layout,
+    Problem,
+    Sightings,
+    State,
+    Surface,
+    moved_state,
+)
+from station.calibration.trajectory import along
+from station.geometry import skew
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _ITERATIONS = 12
 _SMALL_STEP = 2e-6
@@ -38,155 +45,6 @@ _GATE = 11.3
 _REJECT = 60.0
 _MEDIAN = 2.366
 """Of the squared deviation of three numbers."""
-_FOOT = 7
-"""Of a camera's unknowns, pose (6) and clock (1) come before the depth correction."""
-_CAMERA = _FOOT + depth_correction.PARAMETERS
-
-
-@dataclass(frozen=True, slots=True)
-class Sightings:
-    """One camera's detections as arrays; shorter patch lists are padded with weight zero."""
-
-    camera: str
-    times_s: Array
-    """(n,)"""
-    centers: Array
-    """(n, 3), camera frame, as detected without depth correction."""
-    ray: Array
-    """(n, k, 2): x, y of rays (x, y, 1)."""
-    inverse: Array
-    """(n, k)"""
-    weight: Array
-    """(n, k): 1 / variance."""
-    place: Array
-    """(n, k, 2): x, y in the image, from -1 to 1."""
-
-    @classmethod
-    def of(cls, camera: CameraCalibration, detections: Sequence[BallDetection]) -> Sightings:
-        longest = max((len(detection.patches) for detection in detections), default=1)
-        patches = np.zeros((len(detections), longest, 4))
-        patches[..., 2:] = (0.6, np.inf)
-        for row, detection in zip(patches, detections, strict=True):
-            row[: len(detection.patches)] = detection.patches
-        return cls(
-            camera=camera.name,
-            times_s=np.array([detection.time_s for detection in detections]),
-            centers=np.array([detection.center_m for detection in detections]).reshape(-1, 3),
-            ray=_rays(camera, patches),
-            inverse=patches[..., 2],
-            weight=1.0 / patches[..., 3],
-            place=depth_correction.image_place(camera, patches[..., :2]),
-        )
-
-    def take(self, chosen: NDArray[np.bool_]) -> Sightings:
-        """Some of them."""
-        return Sightings(
-            self.camera, self.times_s[chosen], self.centers[chosen], self.ray[chosen],
-            self.inverse[chosen], self.weight[chosen], self.place[chosen],
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Surface:
-    """One camera's view of a flat surface, as normal equations of (m, depth correction)."""
-
-    camera: str
-    surface: str
-    normal: Array
-    """(8, 8)"""
-    pull: Array
-    """(8,) at m = 0 and no correction."""
-
-    @classmethod
-    def of(cls, camera: CameraCalibration, seen: PlaneObservation, name: str) -> Surface:
-        patches = seen.patches
-        ray = np.concatenate([_rays(camera, patches), np.ones((len(patches), 1))], axis=1)
-        weight = 1.0 / patches[:, 3]
-        m = np.linalg.solve(ray.T @ (ray * weight[:, None]), ray.T @ (weight * patches[:, 2]))
-        place = depth_correction.image_place(camera, patches[:, :2])
-        rows = np.concatenate([-ray, depth_correction.design(ray @ m, place)], axis=1)
-        weighted = rows / patches[:, 3:]
-        return cls(camera.name, name, weighted.T @ rows, weighted.T @ patches[:, 2])
-
-    @property
-    def plane(self) -> Array:
-        """m (3,) of 1/z = m . (x, y, 1) without correction."""
-        return np.asarray(np.linalg.solve(self.normal[:3, :3], -self.pull[:3]))
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """What is to be brought into agreement."""
-
-    cameras: Mapping[str, CameraCalibration]
-    reference: str
-    radius_m: float
-    waved: Mapping[str, Sightings]
-    resting: Mapping[str, Sequence[Sightings]]
-    """Name of a place -> what each camera saw of the ball resting there."""
-    surfaces: Sequence[Surface]
-
-
-@dataclass(frozen=True)
-class State:
-    """A solution, or the way to it, in the reference camera's frame."""
-
-    poses: Mapping[str, Array]
-    """reference_from_camera, 4x4."""
-    clock_s: Mapping[str, float]
-    """What is added to a camera's times."""
-    corrections: Mapping[str, Array]
-    """(5,) each, ``depth_correction``'s parameters."""
-    grid: TimeGrid
-    controls: Array
-    """(count, 3) of the ball's path."""
-    places: Mapping[str, Array]
-    """Where the ball rested, (3,)."""
-    planes: Mapping[str, Array]
-    """q (3,) of q . X = 1."""
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Of the border's unknowns, by ``Layout``."""
-    deviations: Mapping[str, Array] = field(default_factory=dict)
-    """Squared deviation (n,) of each waved detection's centre in units of its noise."""
-    scale: float = 1.0
-    """Observed over expected standard deviation."""
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where the border's unknowns stand."""
-
-    starts: Mapping[str, int]
-    """Of each camera, place and plane; the reference camera has its depth correction alone."""
-    size: int
-    reference: str
-
-    @classmethod
-    def of(cls, problem: Problem) -> Layout:
-        starts, size = {}, 0
-        for name in problem.cameras:
-            # The reference's missing pose and clock point before its start, and are left out.
-            starts[name] = size - (_FOOT if name == problem.reference else 0)
-            size += _CAMERA - (_FOOT if name == problem.reference else 0)
-        for name in (*problem.resting, *dict.fromkeys(s.surface for s in problem.surfaces)):
-            starts[name] = size
-            size += 3
-        return cls(starts, size, problem.reference)
-
-    def camera(self, name: str) -> Indices:
-        """Indices (12,) of pose, clock and correction; -1 where they are fixed."""
-        index = np.arange(_CAMERA) + self.starts[name]
-        if name == self.reference:
-            index[:_FOOT] = -1
-        return index
-
-    def correction(self, name: str) -> Indices:
-        """Indices (5,) of the depth correction."""
-        return self.camera(name)[_FOOT:]
-
-    def triple(self, name: str) -> Indices:
-        """Indices (3,) of a place or plane."""
-        return np.arange(3) + self.starts[name]
 
 
 def ball_inverse_depth(center: Array, ray: Array, radius_m: float) -> tuple[Array, Array]:
@@ -273,9 +131,8 @@ class _Equations:
                 self._add_resting(place, seen, problem, layout, state)
         for surface in problem.surfaces:
             self._add_surface(surface, layout, state)
-        if FLOOR in state.planes:
-            for place in problem.resting:
-                self._add_contact(place, problem.radius_m, layout, state)
+        for place in problem.resting:
+            self._add_contact(place, problem.radius_m, layout, state)
 
     def solve(self) -> tuple[Array, Array]:
         """Steps of the border (m,) and of the path (count, 3)."""
@@ -347,13 +204,15 @@ class _Equations:
 
         turn = pose[:3, :3].T
         speed = along(state.controls, first, rate) @ pose[:3, :3]
-        chain = np.zeros((len(centers), 8, _CAMERA + 12))
+        chain = np.zeros((len(centers), 8, PER_CAMERA + 12))
         chain[:, :3, :3] = skew(centers)
         chain[:, :3, 3:6] = -np.eye(3)
         chain[:, :3, 6] = speed
-        chain[:, 3:, _FOOT:_CAMERA] = np.eye(depth_correction.PARAMETERS)
+        chain[:, 3:, FOOT:PER_CAMERA] = np.eye(depth_correction.PARAMETERS)
         for k in range(4):
-            chain[:, :3, _CAMERA + 3 * k : _CAMERA + 3 * k + 3] = value[:, k, None, None] * turn
+            chain[:, :3, PER_CAMERA + 3 * k : PER_CAMERA + 3 * k + 3] = (
+                value[:, k, None, None] * turn
+            )
         carried = normal @ chain
         whole = np.swapaxes(chain, 1, 2) @ carried
         gradient = np.einsum("nij,ni->nj", chain, pull)
@@ -361,17 +220,17 @@ class _Equations:
         index = layout.camera(name)
         kept = index >= 0
         columns = index[kept]
-        camera, path = np.flatnonzero(kept), np.arange(_CAMERA, _CAMERA + 12)
+        camera, path = np.flatnonzero(kept), np.arange(PER_CAMERA, PER_CAMERA + 12)
         self._border[np.ix_(columns, columns)] += whole[:, camera][:, :, camera].sum(axis=0)
         self._border_pull[columns] += gradient[:, camera].sum(axis=0)
         column = 3 * first[:, None] + np.arange(12)
         np.add.at(self._path_pull, column, gradient[:, path])
         for i in range(12):
             for row, place in zip(columns, camera, strict=True):
-                np.add.at(self._coupling[row], column[:, i], whole[:, place, _CAMERA + i])
+                np.add.at(self._coupling[row], column[:, i], whole[:, place, PER_CAMERA + i])
             for j in range(i, 12):
                 np.add.at(
-                    self._band[11 - (j - i)], column[:, j], whole[:, _CAMERA + i, _CAMERA + j]
+                    self._band[11 - (j - i)], column[:, j], whole[:, PER_CAMERA + i, PER_CAMERA + j]
                 )
 
     def _add_resting(
@@ -384,10 +243,10 @@ class _Equations:
             seen, centers, state.corrections[seen.camera], problem.radius_m
         )
         robust = _robust_weight(_deviation(normal, pull))
-        chain = np.zeros((8, _CAMERA + 3))
+        chain = np.zeros((8, PER_CAMERA + 3))
         chain[:3, :3], chain[:3, 3:6] = skew(center), -np.eye(3)
-        chain[3:, _FOOT:_CAMERA] = np.eye(depth_correction.PARAMETERS)
-        chain[:3, _CAMERA:] = pose[:3, :3].T
+        chain[3:, FOOT:PER_CAMERA] = np.eye(depth_correction.PARAMETERS)
+        chain[:3, PER_CAMERA:] = pose[:3, :3].T
         index = np.concatenate([layout.camera(seen.camera), layout.triple(place)])
         self._add_border(
             index, chain, np.einsum("n,nij->ij", robust, normal), np.einsum("n,ni->i", robust, pull)
@@ -398,10 +257,10 @@ class _Equations:
         rotation, shift = pose[:3, :3], pose[:3, 3]
         m = rotation.T @ q / (1.0 - q @ shift)
         at = np.concatenate([m, state.corrections[surface.camera]])
-        chain = np.zeros((8, _CAMERA + 3))
+        chain = np.zeros((8, PER_CAMERA + 3))
         chain[:3, :3], chain[:3, 3:6] = skew(m), np.outer(m, m)
-        chain[3:, _FOOT:_CAMERA] = np.eye(depth_correction.PARAMETERS)
-        chain[:3, _CAMERA:] = rotation.T / (1.0 - q @ shift) + np.outer(m, shift) / (
+        chain[3:, FOOT:PER_CAMERA] = np.eye(depth_correction.PARAMETERS)
+        chain[:3, PER_CAMERA:] = rotation.T / (1.0 - q @ shift) + np.outer(m, shift) / (
             1.0 - q @ shift
         )
         index = np.concatenate([layout.camera(surface.camera), layout.triple(surface.surface)])
@@ -442,32 +301,3 @@ def _robust_weight(deviation: Array) -> Array:
     deviation = deviation / typical
     far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
     return np.where(deviation < _REJECT, far, 0.0)
-
-
-def _rays(camera: CameraCalibration, patches: Array) -> Array:
-    """(..., 2): x, y of the rays (x, y, 1) through the patches' middles, the lens undone."""
-    if not camera.distortion.any():
-        K = camera.K
-        return np.asarray((patches[..., :2] - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1]))
-    flat = patches[..., :2].reshape(-1, 1, 2)
-    undone = cv2.undistortPoints(flat, camera.K, camera.distortion)
-    return np.asarray(undone.reshape((*patches.shape[:-1], 2)), np.float64)
-
-
-def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> State:
-    """The state after a step of the border's unknowns."""
-    poses, clocks, corrections = {}, {}, {}
-    for name in problem.cameras:
-        index = layout.camera(name)
-        moved = name != layout.reference
-        poses[name] = state.poses[name] @ se3_exp(step[index[:6]]) if moved else state.poses[name]
-        clocks[name] = state.clock_s[name] + (float(step[index[6]]) if moved else 0.0)
-        corrections[name] = state.corrections[name] + step[index[_FOOT:]]
-    return replace(
-        state,
-        poses=poses,
-        clock_s=clocks,
-        corrections=corrections,
-        places={name: at + step[layout.triple(name)] for name, at in state.places.items()},
-        planes={name: q + step[layout.triple(name)] for name, q in state.planes.items()},
-    )

@@ -29,6 +29,7 @@ SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
 EMPTY, BALL, MARK, FRONT, WALL = "empty", "ball", "mark", "front", "wall"
+AROUND = "around"
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
@@ -56,6 +57,8 @@ class Session:
     balls: list[BallDetection] = field(default_factory=list)
     planes: dict[str, list[PlaneObservation]] = field(default_factory=dict)
     """Step -> the surfaces seen in it."""
+    around: dict[str, list[BallDetection]] = field(default_factory=dict)
+    """Place -> the ball resting on the floor there."""
     lenses: dict[str, Lens] = field(default_factory=dict)
     runs: int = 0
     _later_s: float | None = 0.0
@@ -121,7 +124,7 @@ class Session:
     def observations(self) -> Observations:
         """What the calibration is solved from."""
         planes = [plane for seen in self.planes.values() for plane in seen]
-        return Observations(self.balls, self.mark, self.front, planes)
+        return Observations(self.balls, self.mark, self.front, planes, self.around)
 
     def done(self, step: str) -> bool:
         """Whether a step has been finished (waving never is: more of it always helps)."""
@@ -153,7 +156,7 @@ class Session:
         self._append({"step": place, "planes": [plane.to_json() for plane in planes]})
 
     def keep_resting(self, step: str, balls: Sequence[BallDetection]) -> None:
-        """The ball on the mark (MARK) or in front of it (FRONT)."""
+        """The ball on the mark (MARK), in front of it (FRONT) or elsewhere ("around-0", ...)."""
         self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
 
     def begin_run(self) -> None:
@@ -221,6 +224,8 @@ class Session:
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
+        elif step.startswith(AROUND):
+            self.around[step] = [BallDetection.from_json(ball) for ball in entry["balls"]]
         elif step == "board":
             for name, lens in entry["lenses"].items():
                 self.lenses.pop(str(name), None)

@@ -15,7 +15,14 @@ from station.clock import DeviceClock
 from station.depth.average import average
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import TICK_HZ
-from station.drivers.virtual_calibration import BALL, EMPTY, FRONT, MARK, VirtualProcedure
+from station.drivers.virtual_calibration import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    MARK,
+    VirtualProcedure,
+)
 
 _Depth = NDArray[np.float32]
 
@@ -28,7 +35,7 @@ _LOOK_S = 1.0
 def simulate(
     procedure: VirtualProcedure, camera: CameraCalibration, *, stride: int = 2
 ) -> Observations:
-    """What one camera contributes: ball every stride-th frame, mark, floor, boards."""
+    """What one camera contributes: ball every stride-th frame, resting places, floor, boards."""
     name = camera.name
     index = list(procedure.booth.rig.cameras).index(name)
     rng = np.random.default_rng((procedure.booth.seed, index, 4))
@@ -65,4 +72,7 @@ def simulate(
             planes.append(
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )
-    return Observations(waved, mark, front, [plane for plane in planes if plane is not None])
+    around = {step: balls(step, _LOOK_S, 2) for step in procedure.steps if step.startswith(AROUND)}
+    return Observations(
+        waved, mark, front, [plane for plane in planes if plane is not None], around
+    )

@@ -23,10 +23,13 @@ from station.calibration.initial import (
     confirmed,
     first_state,
     named_surfaces,
+    resting_places,
     sorted_detections,
+    spread_m,
 )
-from station.calibration.joint import Problem, Sightings, State, solve_joint
+from station.calibration.joint import solve_joint
 from station.calibration.pairwise import Pair, chain, relate_all
+from station.calibration.problem import Problem, Sightings, State
 from station.calibration.rig import CameraCalibration, Rig
 from station.calibration.world import Placed
 from station.errors import CalibrationError
@@ -42,6 +45,14 @@ _LARGEST_SIGMA_M = 0.002
 _LARGEST_SIGMA_RAD = np.radians(0.1)
 _LARGEST_SCATTER = 3.0
 _MARK_TOLERANCE_M = 0.008
+_LEAST_SPREAD_M = 0.15
+"""Of the places where the ball rested, from one line, where no camera sees the floor."""
+_LARGEST_SLOPE_RAD = np.radians(0.1)
+"""A body's head is 3 mm to one side at that."""
+_AROUND_WORDS = (
+    "lay it to the left, to the right and behind the mark, half a metre away, where the lower "
+    "cameras see it (station calibrate around)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +168,7 @@ def solve(
     )
     placed = world.place(problem, state, front_cameras)
     _check_sigma(placed, reference, covered)
+    _check_slope(placed)
     _check_mark(placed, radius_m)
     rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
     weak = () if covered.enough else (covered.advice(),)
@@ -180,7 +192,8 @@ def _problem(
         for name, camera in cameras.items()
     }
     resting: dict[str, list[Sightings]] = {}
-    for place, seen in ((world.MARK, observations.mark), (world.FRONT, observations.front)):
+    places = {world.MARK: observations.mark, world.FRONT: observations.front, **observations.around}
+    for place, seen in places.items():
         views = [at_rest(seen, camera, radius_m) for camera in cameras.values()]
         there = [view for view in views if view is not None]
         if there:
@@ -192,10 +205,12 @@ def _problem(
         )
     surfaces = named_surfaces(observations.planes, cameras, poses)
     if not any(surface.surface == FLOOR for surface in surfaces):
-        raise CalibrationError(
-            "no camera saw enough of the floor; clear it, or tilt a lower camera down a little, "
-            "and do the floor step again"
-        )
+        spread = spread_m(np.array(list(resting_places(resting, poses).values())))
+        if spread < _LEAST_SPREAD_M:
+            raise CalibrationError(
+                "no camera saw enough of the floor, and the ball did not lie on it at three "
+                f"places away from one line: {_AROUND_WORDS}"
+            )
     return Problem(cameras, reference, radius_m, waved, resting, surfaces)
 
 
@@ -342,6 +357,14 @@ def _check_sigma(placed: Placed, reference: str, covered: Coverage) -> None:
                 f"camera {name} is known to {1e3 * shift:.1f} mm and {np.degrees(turn):.2f} "
                 f"degrees only: wave the ball longer, near to {name} and far from it{more}"
             )
+
+
+def _check_slope(placed: Placed) -> None:
+    if placed.slope_sigma_rad > _LARGEST_SLOPE_RAD:
+        raise CalibrationError(
+            f"the floor's slope is known to {np.degrees(placed.slope_sigma_rad):.2f} degrees only; "
+            f"with the ball, {_AROUND_WORDS}"
+        )
 
 
 def _check_mark(placed: Placed, radius_m: float) -> None:

@@ -35,7 +35,7 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
     """Keep what the cameras see of the booth without anybody in it, and its floor.
 
     Raises:
-        CalibrationError: something moved, or no camera sees the floor.
+        CalibrationError: something moved.
     """
     taken = _still_frames(feed, session, guide, _EMPTY_FRAMES)
     cameras = session.lensed_cameras()
@@ -44,14 +44,14 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
         for name, (stack, scale_m) in taken.items()
         if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
     ]
-    if not floors:
-        raise CalibrationError(
-            "no camera sees the floor: free it in front of the lower cameras, or tilt one down"
-        )
     views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
     session.keep_empty(views, floors)
     seen = ", ".join(floor.camera for floor in floors)
-    guide.done(f"empty booth kept; the floor is seen by {seen}")
+    guide.done(
+        f"empty booth kept; the floor is seen by {seen}"
+        if floors
+        else "empty booth kept; no camera sees the floor well, so the ball has to show it"
+    )
 
 
 def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None:
@@ -165,7 +165,7 @@ def wave_ball(
     """
     coverage = covered(session, reference)
     session.begin_run()
-    resets = feed.clock_resets()
+    resets: dict[str, int] = {}
     waiting: list[BallDetection] = []
 
     def keep(balls: list[BallDetection]) -> None:
@@ -181,13 +181,16 @@ def wave_ball(
     with BallFinder(session, patient=feed.replays) as finder:
         try:
             while not feed.over:
-                finder.look(feed.newest())
+                for frame in feed.newest():
+                    if resets.setdefault(frame.camera, frame.clock_resets) != frame.clock_resets:
+                        # What follows cannot be put in time with what went before, of which some
+                        # is still being looked at.
+                        keep(finder.found(wait=True))
+                        write()
+                        session.begin_run()
+                        resets[frame.camera] = frame.clock_resets
+                    finder.look([frame])
                 keep(finder.found())
-                if feed.clock_resets() != resets:
-                    # What follows cannot be put in time with what went before.
-                    write()
-                    resets = feed.clock_resets()
-                    session.begin_run()
                 now_s = time.monotonic()
                 if now_s - written_s > _WRITE_EVERY_S:
                     write()
@@ -201,6 +204,8 @@ def wave_ball(
             guide.say("stopped; what was seen is kept")
         finally:
             write()
+    if feed.replays and feed.missed:
+        guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
     for name, (near, moments) in coverage.ties().items():

@@ -2,13 +2,17 @@
 
 calibrations/20261121T100000Z/   calibration.json, report.json, what it was solved from
 calibrations/unfinished/         the one that is being done
+calibrations/calibrate.lock      held by whoever calibrates
 calibration.json                 a copy of the one in use
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +24,7 @@ from station.errors import CalibrationError
 from station.files import fsync_folder, private_folder, publish_folder, write_bytes, write_json
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
-_ABANDONED = "abandoned-"
+_ABANDONED, LOCK = "abandoned-", "calibrate.lock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,27 @@ class CalibrationStore:
 
     folder: Path
     in_use: Path
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the store alone: two that calibrate at once would write into one journal.
+
+        Raises:
+            CalibrationError: another process holds it.
+        """
+        path = private_folder(self.folder) / LOCK
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise CalibrationError(
+                    f"another station calibrate is at work in {self.folder}; end it first"
+                ) from None
+            yield
+        finally:
+            # Closing frees it; so does the end of the process, whatever ended it.
+            os.close(descriptor)
 
     @property
     def unfinished(self) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detections import FLOOR
-from station.calibration.joint import Layout, Problem, State, moved_state
+from station.calibration.problem import Layout, Problem, State, moved_state
 from station.geometry import invert, rigid, skew, so3_log
 
 Array = NDArray[np.float64]
@@ -30,6 +30,8 @@ class Placed:
     """(6 n, 6 n) of all cameras' xi in world_from_camera @ se3_exp(xi), in their order."""
     mark_height_m: float
     """Of the resting ball's centre above the floor."""
+    slope_sigma_rad: float
+    """Largest standard deviation of the floor's slope, as the reference camera sees it."""
 
 
 def world_from_reference(state: State, front_cameras: Sequence[str]) -> Array:
@@ -74,7 +76,17 @@ def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Place
         world_from_camera=dict(zip(problem.cameras, here, strict=True)),
         covariance=jacobian @ state.covariance @ jacobian.T,
         mark_height_m=_above(state, state.places[MARK]),
+        slope_sigma_rad=_slope_sigma(layout, state),
     )
+
+
+def _slope_sigma(layout: Layout, state: State) -> float:
+    q = state.planes[FLOOR]
+    index = layout.triple(FLOOR)
+    up = q / np.linalg.norm(q)
+    tilt = (np.eye(3) - np.outer(up, up)) / np.linalg.norm(q)
+    covariance = tilt @ state.covariance[np.ix_(index, index)] @ tilt.T
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def twist_between(pose: Array, other: Array) -> Array:

@@ -16,14 +16,14 @@ from station.drivers.virtual import (
     SimulatedUnit,
     VirtualFrame,
 )
-from station.drivers.virtual_noise import TrueView, observe
+from station.drivers.virtual_noise import NoiselessView, TrueView, observe
 from station.drivers.virtual_round import Capsule, ball, overlay
 from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, box
 from station.errors import InputError
 
 Array = NDArray[np.float64]
 
-EMPTY, BALL, MARK, FRONT = "empty", "ball", "mark", "front"
+EMPTY, BALL, MARK, FRONT, AROUND = "empty", "ball", "mark", "front", "around"
 _REST_S = 2.0
 _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""
@@ -43,11 +43,15 @@ class VirtualProcedure:
     """How far in front of the mark the ball rests the second time."""
     board_at_m: tuple[float, ...] = (-0.6, -0.2, 0.2, 0.6)
     """y of the board's middle at each of its places."""
+    around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
+    """x, y of the ball at each of its places on the floor around the mark."""
 
     @property
     def steps(self) -> tuple[str, ...]:
         """In the order in which they are done."""
-        return (EMPTY, BALL, MARK, FRONT, *(f"wall-{i}" for i in range(len(self.board_at_m))))
+        walls = (f"wall-{i}" for i in range(len(self.board_at_m)))
+        around = (f"{AROUND}-{i}" for i in range(len(self.around_m)))
+        return (EMPTY, BALL, MARK, FRONT, *walls, *around)
 
     def starts_s(self, step: str) -> float:
         """When a step begins, true time."""
@@ -68,14 +72,15 @@ class VirtualProcedure:
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, step)
         # Behind what moves a short loop flickers on; only what moves is drawn anew each frame.
-        moves = step in (BALL, MARK, FRONT)
-        loop = [observe(view, unit.error, rng) for _ in range(_STILL_FRAMES if moves else 0)]
+        moves = step in (BALL, MARK, FRONT) or step.startswith(AROUND)
+        still = NoiselessView.of(view, unit.error)
+        loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
         first = int(np.ceil((start_s - unit.phase_s) * FRAME_RATE_HZ))
         lasts_s = min(self._lasts_s(step), limit_s or np.inf)
         for sequence in range(first, first + int(lasts_s * FRAME_RATE_HZ), stride):
             time_s = unit.phase_s + sequence / FRAME_RATE_HZ
-            raw = loop[int(rng.integers(len(loop)))] if moves else observe(view, unit.error, rng)
+            raw = loop[int(rng.integers(len(loop)))] if moves else still.read(rng)
             drawn = overlay(view, calibration, self._moving(step, time_s))
             if drawn is not None:
                 part, window = drawn
@@ -113,6 +118,9 @@ class VirtualProcedure:
             return [ball(np.array([0.0, 0.0, self.radius_m]), self.radius_m)]
         if step == FRONT:
             return [ball(np.array([0.0, -self.front_m, self.radius_m]), self.radius_m)]
+        if step.startswith(AROUND):
+            x, y = self.around_m[int(step.removeprefix(f"{AROUND}-"))]
+            return [ball(np.array([x, y, self.radius_m]), self.radius_m)]
         return []
 
     @cached_property

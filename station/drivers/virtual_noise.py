@@ -89,35 +89,58 @@ def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
     return np.asarray(facing + np.where(angle > _STEEP_RAD, steep, 0.0), np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class NoiselessView:
+    """What one unit would read of a view without its noise, (h, w) each."""
+
+    depth_m: Image
+    seen: NDArray[np.bool_]
+    sigma_m: Image
+    fade: Image
+    """Probability of no reading at a slant."""
+
+    @classmethod
+    def of(cls, view: TrueView, unit: UnitError, window: Window | None = None) -> NoiselessView:
+        """Of a part of the image where a window is given."""
+        depth = unit.apply(view.depth_m, window)
+        return cls(
+            depth_m=depth,
+            seen=(depth > 0) & view.lit & view.reflects,
+            sigma_m=axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD)),
+            fade=(view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD),
+        )
+
+    def read(self, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """One noisy raw 11-bit frame (h, w)."""
+        white = rng.standard_normal(self.depth_m.shape, dtype=np.float32)
+        blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
+        noise = blurred / max(float(blurred.std()), 1e-6)
+        measured = np.where(self.seen, self.depth_m + self.sigma_m * noise, 0.0).astype(np.float32)
+        measured[rng.random(self.depth_m.shape, dtype=np.float32) < self.fade] = 0.0
+        return raw_from_depth(_flying(measured, rng))
+
+
 def observe(
     view: TrueView, unit: UnitError, rng: np.random.Generator, window: Window | None = None
 ) -> NDArray[np.uint16]:
     """One noisy raw 11-bit frame (h, w) of what a perfect sensor would see."""
-    depth = unit.apply(view.depth_m, window)
-    seen = (depth > 0) & view.lit & view.reflects
-    white = rng.standard_normal(depth.shape, dtype=np.float32)
-    blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
-    noise = blurred / max(float(blurred.std()), 1e-6)
-    sigma = axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD))
-    measured = np.where(seen, depth + sigma * noise, 0.0).astype(np.float32)
-    fade = (view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD)
-    measured[rng.random(depth.shape, dtype=np.float32) < fade] = 0.0
-    return raw_from_depth(_flying(measured, rng))
+    return NoiselessView.of(view, unit, window).read(rng)
 
 
 def _flying(depth: Image, rng: np.random.Generator) -> Image:
     """Silhouette pixels flicker: some vanish, some jump to the other side, some lie between."""
-    filled = np.where(depth > 0, depth, 9.0).astype(np.float32)
+    filled = np.where(depth > 0, depth, np.float32(9.0))
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(filled, window), cv2.dilate(filled, window)
-    edge = far - near > 0.05
-    fate = rng.random(depth.shape, dtype=np.float32)
+    edge = np.flatnonzero(far - near > 0.05)
+    fate = rng.random(depth.shape, dtype=np.float32).ravel()[edge]
+    share = rng.random(depth.shape, dtype=np.float32).ravel()[edge]
+    near, far = near.ravel()[edge], far.ravel()[edge]
     far = np.where(far > 8.0, near, far)
-    between = near + (far - near) * rng.random(depth.shape, dtype=np.float32)
-    result = depth.copy()
-    result[edge & (fate < 0.30)] = 0.0
-    swapped = edge & (fate >= 0.30) & (fate < 0.55)
-    result[swapped] = near[swapped]
-    flying = edge & (fate >= 0.55) & (fate < 0.65)
-    result[flying] = between[flying]
-    return result
+    result = depth.ravel().copy()
+    result[edge[fate < 0.30]] = 0.0
+    swapped = (fate >= 0.30) & (fate < 0.55)
+    result[edge[swapped]] = near[swapped]
+    flying = (fate >= 0.55) & (fate < 0.65)
+    result[edge[flying]] = (near + (far - near) * share)[flying]
+    return result.reshape(depth.shape)

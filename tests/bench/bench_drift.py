@@ -25,7 +25,7 @@ from station.calibration.rig import CameraCalibration
 from station.calibration.scene import StaticView, static_view
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import SimulatedBooth, SimulatedUnit
-from station.drivers.virtual_noise import TrueView, observe
+from station.drivers.virtual_noise import NoiselessView, TrueView
 from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, fixed_posts, load_mesh
 from station.geometry import se3_exp
 
@@ -70,7 +70,8 @@ class _Sensor:
         return scene.view(self.camera, moved)
 
     def frames(self, view: TrueView, count: int) -> list[NDArray[np.uint16]]:
-        return [TABLE[observe(view, self._unit.error, self._rng)] for _ in range(count)]
+        still = NoiselessView.of(view, self._unit.error)
+        return [TABLE[still.read(self._rng)] for _ in range(count)]
 
     def estimate(self, view: TrueView, frames: int) -> CameraMove:
         return estimate_move(self.reference, self.frames(view, frames), DEPTH_SCALE_M)

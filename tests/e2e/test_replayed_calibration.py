@@ -69,7 +69,7 @@ def test_a_booth_is_calibrated_from_replayed_recordings(recorded: Path) -> None:
         # The world frame itself: floor, mark, and where the person faces.
         place = found.cameras[name].world_from_camera[:3, 3]
         assert np.linalg.norm(place - truth.cameras[name].world_from_camera[:3, 3]) < 0.03
-    entries = [path.name for path in (recorded / "calibrations").iterdir()]
+    entries = [path.name for path in (recorded / "calibrations").iterdir() if path.is_dir()]
     assert len(entries) == 1
     entry = recorded / "calibrations" / entries[0]
     assert json.loads((entry / "report.json").read_text())
@@ -87,7 +87,7 @@ def test_live_cameras_are_looked_at_like_recordings(make_station: Callable[..., 
     )
     done = station.command("calibrate", "floor", "--yes")
     assert done.returncode == 0, done.stderr
-    assert "empty booth kept; the floor is seen by" in done.stdout
+    assert "empty booth kept" in done.stdout
     session = Session.load(station.config.parent / "calibrations/unfinished")
     assert set(session.cameras) == {"front-lower", "front-upper", "back-lower", "back-upper"}
     assert session.background("back-upper") is not None

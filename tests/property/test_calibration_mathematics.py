@@ -87,7 +87,7 @@ def test_covariances_between_cameras_are_carried_by_their_geometry(seed: int) ->
     rng = np.random.default_rng(seed)
     poses = {name: se3_exp(rng.uniform(-1.5, 1.5, 6)) for name in "abc"}
     root = rng.normal(0, 1e-4, (18, 18))
-    placed = Placed(poses, root @ root.T, 0.1)
+    placed = Placed(poses, root @ root.T, 0.1, 0.0)
     found, covariance = relatives(placed, "b", ["a", "c"])
     columns = []
     for column in root.T:

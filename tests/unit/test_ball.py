@@ -17,7 +17,7 @@ from station.drivers.virtual_noise import UnitError, observe
 from station.drivers.virtual_round import Capsule, ball, overlay
 from station.drivers.virtual_scene import VirtualScene, booth_walls, default_rig, look_at, sphere
 from station.errors import FormatError
-from station.geometry import invert, transform
+from station.geometry import invert, se3_exp, transform
 
 CENTER = np.array([0.1, 0.05, 1.3])
 
@@ -122,8 +122,11 @@ def test_a_person_who_waves_it_is_not_taken_for_it(procedure: VirtualProcedure) 
 
 def test_floor_and_board_are_seen_without_bias(procedure: VirtualProcedure) -> None:
     """Pixels beside missing ones stand too near: they once lifted a floor by 5 mm."""
-    name = "back-lower"
-    camera = procedure.booth.rig.cameras[name]
+    name, rig = "back-lower", procedure.booth.rig
+    pose = rig.cameras[name].world_from_camera @ se3_exp([np.radians(-5.0), 0, 0, 0, 0, 0])
+    camera = replace(rig.cameras[name], world_from_camera=pose)
+    booth = replace(procedure.booth, rig=replace(rig, cameras={**rig.cameras, name: camera}))
+    procedure = replace(procedure, booth=booth)
     empty = np.stack([TABLE[frame.raw] for frame in procedure.frames(name, EMPTY, stride=2)])
     board = np.stack([TABLE[frame.raw] for frame in procedure.frames(name, "wall-1", stride=6)])
     background = average(empty, DEPTH_SCALE_M).depth_m
@@ -136,6 +139,16 @@ def test_floor_and_board_are_seen_without_bias(procedure: VirtualProcedure) -> N
         rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=1)
         away = transform(camera.world_from_camera, rays / w[:, None]) @ normal - distance
         assert abs(np.mean(away)) < 5e-4
+        slope = np.polyfit(v, away, 1)[0]
+        assert abs(slope) * np.ptp(v) < 5e-4
+
+
+def test_a_floor_with_gaps_is_left_out(procedure: VirtualProcedure) -> None:
+    """At 67 degrees of incidence what is left between the gaps rises by half a millimetre a degree:
+    a strip of it leaned a whole booth by 0.2 degrees."""
+    name = "back-lower"
+    empty = np.stack([TABLE[frame.raw] for frame in procedure.frames(name, EMPTY, stride=2)])
+    assert observe_floor(empty, DEPTH_SCALE_M, procedure.booth.rig.cameras[name]) is None
 
 
 def test_what_was_seen_survives_its_file(camera: CameraCalibration) -> None:

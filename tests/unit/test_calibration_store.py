@@ -86,6 +86,17 @@ def test_a_file_from_elsewhere_is_kept_when_another_is_put_into_use(
     assert store.scene() == {}
 
 
+def test_two_do_not_calibrate_at_once(store: CalibrationStore) -> None:
+    """Two runs once wrote into one journal, and both waved their own ball."""
+    other = CalibrationStore(store.folder, store.in_use)
+    with store.locked():
+        with pytest.raises(CalibrationError, match="another station calibrate"), other.locked():
+            pass
+        assert store.entries() == []
+    with other.locked():
+        pass
+
+
 def test_what_was_begun_is_set_aside_not_lost(store: CalibrationStore) -> None:
     assert store.set_aside() is None
     for number in (1, 2):
@@ -100,6 +111,7 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     view = static_view([np.full((480, 640), 20000, np.uint16)] * 2, 1e-4)
     session.keep_empty({"front-lower": view}, [floor])
     session.keep_resting(MARK, [_ball("front-lower", 5.0)])
+    session.keep_resting("around-0", [_ball("front-lower", 9.0)])
     session.begin_run()
     session.keep_balls([_ball("front-lower", 100.0), _ball("front-upper", 100.01)])
     session.begin_run()
@@ -119,6 +131,7 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert observations.balls[2].time_s - observations.balls[1].time_s == pytest.approx(10.0)
     assert observations.balls[1].time_s - observations.balls[0].time_s == pytest.approx(0.01)
     assert len(observations.mark) == len(observations.planes) == 1
+    assert [ball.time_s for ball in observations.around["around-0"]] == [9.0]
     assert again.lensed_cameras()["front-upper"].K[0, 0] == 600.0
     assert again.lensed_cameras()["front-lower"].K[0, 0] == 585.0
     assert again.background("front-lower") is not None

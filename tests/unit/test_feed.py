@@ -31,7 +31,7 @@ def _record(folder: Path, count: int = 12, start_s: float = 100.0) -> None:
 
 
 def _header(ticks: int) -> FrameHeader:
-    return FrameHeader("front", "A", 640, 480, 1e-4, ticks, _HZ, 5.0, 5.0, 1)
+    return FrameHeader("front", "A", 640, 480, 1e-4, ticks, _HZ, 5.0, 5.0, 1, 0)
 
 
 def test_a_replays_times_are_those_of_its_recording(tmp_path: Path) -> None:
@@ -43,6 +43,7 @@ def test_a_replays_times_are_those_of_its_recording(tmp_path: Path) -> None:
     assert np.allclose(np.array(times, float), [100.0 + i / 30.0 for i in order], atol=1e-5)
     assert clock.over
     assert clock.time_s(_header(_FIRST_TICK)) is None
+    assert clock.missed == 6
 
 
 def test_a_replay_that_starts_over_without_its_last_frame_is_over(tmp_path: Path) -> None:
@@ -51,6 +52,9 @@ def test_a_replay_that_starts_over_without_its_last_frame_is_over(tmp_path: Path
     assert clock.time_s(_header(_FIRST_TICK + 2_000_000)) is not None
     assert clock.time_s(_header(_FIRST_TICK)) is None
     assert clock.over
+    assert clock.missed == 11
+    assert clock.time_s(_header(_FIRST_TICK)) is None
+    assert clock.missed == 11
 
 
 def test_a_frame_of_another_recording_is_refused(tmp_path: Path) -> None:

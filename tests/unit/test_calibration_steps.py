@@ -1,0 +1,78 @@
+"""The steps of a calibration on frames that are made up."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from station.calibration import finder
+from station.calibration.detections import BallDetection
+from station.calibration.feed import Feed, TimedFrame
+from station.calibration.guide import Guide
+from station.calibration.session import Session
+from station.calibration.steps import wave_ball
+from station.drivers.virtual_scene import default_rig
+
+_CAMERAS = ("front-lower", "front-upper")
+
+
+class _Frames:
+    """A feed of a frame of each camera at a time; one camera's clock is reset midway."""
+
+    replays = True
+    missed = 3
+
+    def __init__(self, moments: int, reset_at: int) -> None:
+        self._moments, self._reset_at, self._next = moments, reset_at, 0
+
+    @property
+    def over(self) -> bool:
+        return self._next == self._moments
+
+    def newest(self) -> list[TimedFrame]:
+        moment, self._next = self._next, self._next + 1
+        late = moment >= self._reset_at
+        return [
+            TimedFrame(
+                name,
+                # Its clock says something else from the reset on.
+                0.1 * moment + (500.0 if late and name == _CAMERAS[0] else 0.0),
+                np.zeros((4, 4), np.uint16),
+                1e-3,
+                clock_resets=int(late and name == _CAMERAS[0]),
+            )
+            for name in _CAMERAS
+        ]
+
+
+def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames pending at a reset of a clock once fell into the next run, seconds off."""
+
+    def find_slowly(*args: Any, **_: Any) -> BallDetection:
+        time.sleep(0.002)
+        _, camera, _, time_s = args
+        return BallDetection(
+            camera.name, time_s, np.array([0, 0, 1.5]), np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4))
+        )
+
+    monkeypatch.setattr(finder, "find_ball", find_slowly)
+    rig = default_rig().cameras
+    session = Session.begin(
+        tmp_path, "2026-11-21T10:00:00Z", 0.1, {name: rig[name] for name in _CAMERAS}
+    )
+    feed = cast(Feed, _Frames(moments=40, reset_at=25))
+    guide = Guide(attended=False, countdown_s=0.0)
+    wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0)
+    seen = Session.load(tmp_path)
+    assert seen.runs == 2
+    assert len(seen.balls) == 80
+    before = [ball for ball in seen.balls if ball.time_s < 2.45]
+    assert len(before) == 50
+    assert sum(ball.camera == _CAMERAS[0] for ball in before) == 25
+    assert "3 frames were missed" in capsys.readouterr().out
