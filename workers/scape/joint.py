@@ -36,9 +36,9 @@ _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
-_COARSE, _FINE = 600, 2000
+_COARSE, _SCOUTS, _FINE = 600, 1200, 2000
 _PULLED_POINTS = 10_000
-_COARSELY_PULLED = 3
+_COARSELY_PULLED = 4
 """While the fit is coarse, every so many of them."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
@@ -83,11 +83,13 @@ class Sampling:
     """Nested sample vertices with the model's derivatives, and who stands for whom."""
 
     body: SampledBody
+    scouts: SampledBody
+    """The first ones: all the skin that the coarse stages look at."""
     normals: Array
-    """(n, 3): of the samples, on the mean body."""
+    """(m, 3): of the scouts, on the mean body."""
     share: Array
-    """(n,): the area that each sample stands for, in those of an average vertex."""
-    coarse_of_sample: NDArray[np.intp]
+    """(m,): the area that each scout stands for, in those of an average vertex."""
+    coarse_of_scout: NDArray[np.intp]
     sample_of_vertex: NDArray[np.intp]
     hands: tuple[Hand, ...]
 
@@ -96,27 +98,30 @@ class Sampling:
         """Samples spread evenly; the first ones alone are spread evenly too."""
         order = _spread(model)
         places = model.mean[order]
-        sample_of_vertex = cKDTree(places).query(model.mean)[1]
+        scouts = places[:_SCOUTS]
+        scout_of_vertex = cKDTree(scouts).query(model.mean)[1]
+        body = model.at(order)
         return cls(
-            model.at(order),
-            vertex_normals(model.mean, model.faces)[order],
-            np.bincount(sample_of_vertex, model.vertex_shares, len(order)).astype(np.float64),
-            cKDTree(places[:_COARSE]).query(places)[1],
-            sample_of_vertex,
+            body,
+            body.first(_SCOUTS),
+            vertex_normals(model.mean, model.faces)[order[:_SCOUTS]],
+            np.bincount(scout_of_vertex, model.vertex_shares, _SCOUTS).astype(np.float64),
+            cKDTree(places[:_COARSE]).query(scouts)[1],
+            cKDTree(places).query(model.mean)[1],
             hands_of(model),
         )
 
     def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
-        """The samples as the skin, their normals turned with the parts."""
-        index = self.body.indices
+        """The scouts, their normals turned with the parts."""
+        index = self.scouts.indices
         turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
         normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
         return Skin(
-            self.body.evaluate(state),
+            self.scouts.evaluate(state),
             normals / np.linalg.norm(normals, axis=1, keepdims=True),
             model.part_of_vertex[index],
             self.share,
-            self.coarse_of_sample,
+            self.coarse_of_scout,
         )
 
     def skin(self, model: BodyModel, state: BodyState) -> Skin:
