@@ -152,6 +152,8 @@ class Target:
     sigma_m: Array
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
+    coarse: OrientedTree
+    """Of these alone."""
     free_space: FreeSpace
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
@@ -160,11 +162,13 @@ class Target:
     def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
         """An even subset of a cloud's points."""
         used = even_subset(len(cloud), most_points)
-        tree = OrientedTree.build(cloud.points[used], cloud.normals[used])
+        points, normals = cloud.points[used], cloud.normals[used]
+        pulled = even_subset(len(used), _PULLED_POINTS)
         return cls(
-            tree,
+            OrientedTree.build(points, normals),
             cloud.sigma_m[used],
-            even_subset(len(used), _PULLED_POINTS),
+            pulled,
+            OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
             cloud.camera[used].astype(np.intp),
         )
@@ -205,7 +209,7 @@ def fit_jointly(
         for step, stage in enumerate(schedule):
             skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
             # What the correspondences need not wait for is done beside them.
-            probed = beside.submit(_probed, target.tree, skin, stage)
+            probed = beside.submit(_probed, target, skin, stage)
             derivative = beside.submit(
                 sampling.body.first(stage.samples).jacobian, state, stage.components
             )
@@ -227,13 +231,12 @@ class _DataTerms:
     correspondences: int
 
 
-def _probed(
-    cloud: OrientedTree, skin: Skin, stage: Stage
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Even places of the skin that have a point, and which."""
+    cloud = target.coarse if stage.coarse else target.tree
     probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
     probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **stage.limits)
-    return probes[probing], found
+    return probes[probing], target.pulled[found] if stage.coarse else found
 
 
 def _data_terms(

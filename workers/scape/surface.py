@@ -25,10 +25,10 @@ from workers.scape.model import BodyModel
 Array = NDArray[np.float64]
 
 _ROUNDS = (
-    # gate, angle, stiffness
-    (0.030, np.radians(50), 240.0),
-    (0.020, np.radians(45), 48.0),
-    (0.012, np.radians(40), 12.0),
+    # gate, angle, stiffness, tolerance of the solve
+    (0.030, np.radians(50), 240.0, 1e-2),
+    (0.020, np.radians(45), 48.0, 1e-2),
+    (0.012, np.radians(40), 12.0, 1e-3),
 )
 _SIGMA_OF_STIFFNESS_M = 0.001
 _FADE = 2.5e-5
@@ -38,7 +38,7 @@ _INDEPENDENT = 0.25
 _LEAST_SIGMA_M = 3e-4
 _SOLE_M = 0.03
 _LIFTED_M = 0.02
-_MOST_POINTS = 90_000
+_MOST_POINTS = 50_000
 """More add nothing beyond what neighbouring readings share."""
 
 
@@ -65,13 +65,13 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     current = vertices
     weight = np.zeros(len(vertices))
     residual = np.zeros(len(vertices))
-    for gate_m, angle_rad, stiffness in _ROUNDS:
+    for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
         normals = vertex_normals(current, model.faces)
         residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
         matrix = (sp.diags(weight) + bending * (laplacian + _FADE * identity)).tocsr()
         step = conjugate_gradients(
-            matrix.indptr, matrix.indices, matrix.data, weight * residual, 1e-4, 250
+            matrix.indptr, matrix.indices, matrix.data, weight * residual, tolerance, 250
         )
         step *= _hold(model, current, normals, step)
         current = current + step[:, None] * normals
