@@ -40,12 +40,11 @@ def self_intersections(vertices: Array, faces: Faces) -> int:
 def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
     """(K,): triangles that look away from where they look on a reference surface (P, 3), and from
     where their surroundings look."""
-    here = area_vectors(vertices, faces)
-    around = vertex_normals(vertices, faces)[faces].sum(axis=1)
-    there = area_vectors(reference, faces)
-    return np.asarray(
-        (np.einsum("ki,ki->k", here, there) <= 0.0) & (np.einsum("ki,ki->k", here, around) <= 0.0)
-    )
+    here, there = area_vectors(vertices, faces), area_vectors(reference, faces)
+    turned = np.einsum("ki,ki->k", here, there) <= 0.0
+    around = vertex_normals(vertices, faces)[faces[turned]].sum(axis=1)
+    turned[turned] = np.einsum("ki,ki->k", here[turned], around) <= 0.0
+    return np.asarray(turned)
 
 
 def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
