@@ -144,7 +144,8 @@ def learn_pose_fields(
     """Q by ridge regression of unposed residual edges on the adjacent joints' twists.
 
     Returns the fields (3 (L - 1), P, 3) and twists (n, 3 (L - 1)) for the prior, those of the poses
-    that were not loosened. The ridge is chosen on a fifth of the poses that the regression did not see.
+    that were not loosened. The ridge is chosen on a fifth of the poses that the regression did not
+    see.
     """
     shapes = database.sample("train", plan.poses, plan.seed + 1)
     poses = database.sample_poses("train", plan.poses, plan.seed)
