@@ -38,6 +38,8 @@ _VERTEX_METRIC = 0.6
 """Weight of vertex positions beside deformation gradients, m^-2 scaled by the body's edge energy:
 gradients alone let small errors add up along a limb."""
 _RIDGE_CANDIDATES = (1e-3, 1e-2, 1e-1, 1.0)
+_REACHES = 0.02
+"""Skin weight, and share of a part's triangles, from which on another part's joint deforms it."""
 _LOOSENED_RAD = np.radians(3.0)
 """Standard deviation of what every second training pose adds to each joint about every axis. The
 poses bend an elbow about one axis and twist it about another; a regression that never saw a turn
@@ -141,7 +143,7 @@ def shape_components(
 def learn_pose_fields(
     model: BodyModel, database: BodyDatabase, plan: TrainingPlan
 ) -> tuple[Array, Array]:
-    """Q by ridge regression of unposed residual edges on the adjacent joints' twists.
+    """Q by ridge regression of unposed residual edges on the twists of the joints around.
 
     Returns the fields (3 (L - 1), P, 3) and twists (n, 3 (L - 1)) for the prior, those of the poses
     that were not loosened. The ridge is chosen on a fifth of the poses that the regression did not
@@ -168,7 +170,7 @@ def learn_pose_fields(
         triangles = owner == part
         if not triangles.any():
             continue
-        features = _adjacent(model.part_parents, part)
+        features = _features(model, part)
         design = twists[:, features]
         target = residuals[:, triangles].reshape(plan.poses, -1)
         errors = [
@@ -198,14 +200,20 @@ def _loosening(database: BodyDatabase, count: int, seed: int) -> Array:
     return turns
 
 
-def _adjacent(parents: NDArray[np.int32], part: int) -> NDArray[np.intp]:
-    """Columns of the twists of a part's own joint, its children's and its siblings'."""
-    family = [p for p in range(1, len(parents)) if p == part or parents[p] == part]
-    if parents[part] >= 0:
-        family += [p for p in range(1, len(parents)) if p == parents[part]]
-        family += [p for p in range(1, len(parents)) if parents[p] == parents[part] and p != part]
-    columns = [3 * (p - 1) + axis for p in sorted(set(family)) for axis in range(3)]
-    return np.array(columns, dtype=np.intp)
+def _features(model: BodyModel, part: int) -> NDArray[np.intp]:
+    """Columns of the twists that deform a part's triangles: of its own joint, its children's, its
+    parent's and its siblings', and of every part whose skin weights reach in. A raised arm lifts
+    the sides of neck and chest, two joints away."""
+    parents = model.part_parents
+    mine = np.argmax(model.triangle_part_weights, axis=1) == part
+    reach = (model.triangle_part_weights[mine] > _REACHES).mean(axis=0) > _REACHES
+    up = parents[part]
+    near = (parents == part) | ((parents == up) & (up >= 0)) | (np.arange(len(parents)) == up)
+    near[part] = True
+    family = np.flatnonzero(near | reach)
+    return np.array(
+        [3 * (p - 1) + axis for p in family if p > 0 for axis in range(3)], dtype=np.intp
+    )
 
 
 def _ridge(design: Array, target: NDArray[np.float32], strength: float) -> Array:
