@@ -22,7 +22,7 @@ from workers.measure.cli import measure
 from workers.measure.definitions import DEFINITIONS, Route, Section
 from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
 from workers.measure.sections import loop_length
-from workers.measure.standing import on_both_feet, standard_state
+from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, BodyState, load_model
@@ -151,6 +151,19 @@ def test_standing_takes_the_scanned_pose_away(model: BodyModel) -> None:
         tables.append({row.name: row.value_m for row in rows})
     for name, value in tables[0].items():
         assert tables[1][name] == pytest.approx(value, abs=0.006), name
+
+
+def test_what_standing_adds_on_the_average_is_taken_off(model: BodyModel) -> None:
+    """Necks and shoulders once came out a centimetre too wide in the standard pose."""
+    state, vertices = _body(model, 4)
+    sigma = np.full(model.vertex_count, 1e-3)
+    traces = trace_all(model, stood_upright(model, vertices, state))
+    rows = measure_standing(model, vertices, state, sigma).rows
+    for trace, row in zip(traces, rows, strict=True):
+        bias = shipped()["standard"][sides_pooled(row.name)].bias
+        assert row.value_m == pytest.approx(max(0.0, trace.value_m - bias)), row.name
+        low, high = row.interval95_m
+        assert low == 0.0 or row.value_m - low == pytest.approx(high - row.value_m), row.name
 
 
 def test_the_standard_pose(model: BodyModel) -> None:
