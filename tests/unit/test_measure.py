@@ -279,12 +279,24 @@ def test_a_results_tables_are_printed_with_their_intervals(
     assert all(float(row["low"]) < float(row["value"]) < float(row["high"]) for row in rows[:9])
     assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
     assert "s1, pose as-scanned" in _run(str(tmp_path))
+    both = CliRunner().invoke(measure, [str(tmp_path), "--json", "--csv"])
+    assert both.exit_code == 2
+    assert "not both" in both.output
 
 
 def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_path: Path) -> None:
     (tmp_path / "cut.ply").write_bytes(ply_mesh(model.mean, model.faces[:-5]))
     (tmp_path / "text.obj").write_text("v one two three\n")
+    for name, vertices in (
+        ("millimetres.obj", 1e3 * model.mean),
+        ("lying.obj", model.mean[:, [0, 2, 1]]),
+        ("floating.obj", model.mean + (0.0, 0.0, 0.5)),
+    ):
+        (tmp_path / name).write_bytes(obj_mesh(vertices, model))
     for source, words in (
+        ("millimetres.obj", "metres were expected"),
+        ("lying.obj", "another axis up"),
+        ("floating.obj", "soles at 0.5"),
         ("cut.ply", "fit it first"),
         ("text.obj", "no usable mesh"),
         ("missing.ply", "not a file"),
