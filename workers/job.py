@@ -13,6 +13,7 @@ from pathlib import Path
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
 from workers.export.meshes import obj_mesh
+from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.measure.body import measure_body, measure_standing
 from workers.scape.fit import FitResult, Method, fit_body, sampling_of
@@ -20,6 +21,7 @@ from workers.scape.intersections import untangled
 from workers.scape.model import BodyModel, load_model
 from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
+from workers.scape.verdict import Verdict
 from workers.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
@@ -45,7 +47,8 @@ def warm_up() -> BodyModel:
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
     compile_average()
-    measure_body(model, model.mean)
+    measured = measure_body(model, model.mean)
+    preview(model.mean, model.faces, measured.rows, Verdict("ok", ()))
     return model
 
 

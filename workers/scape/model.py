@@ -184,17 +184,13 @@ class BodyModel:
     def repose(self, vertices: Array, state: BodyState, new_state: BodyState) -> Array:
         """A free-form surface (P, 3) that was fitted at `state`, carried to another pose.
 
-        What the surface has beyond the model stays with it; the pose-dependent deformation
-        changes with the pose.
+        The body is the model's in the new pose; what the surface has beyond the model turns with
+        the parts that it lies on.
         """
-        surface = self.unturned(vertices, state.rotations)
-        twists = self.relative_twists(new_state.rotations) - self.relative_twists(state.rotations)
-        change = np.tensordot(twists[1:].ravel().astype(np.float32), self.pose_fields, 1)
-        found = self.turned(surface + change, new_state.rotations, new_state.translation)
-        # Blended rotations cannot be undone exactly; what is left over turns with its part.
-        left = vertices - self.turned(surface, state.rotations, self.anchor @ vertices)
+        beyond = vertices - self.vertices(state)
         turns = new_state.rotations @ np.swapaxes(state.rotations, 1, 2)
-        return np.asarray(found + np.einsum("pij,pj->pi", turns[self.part_of_vertex], left))
+        blended = (self.vertex_weights @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
+        return self.vertices(new_state) + np.einsum("vij,vj->vi", blended, beyond)
 
     def part_rotations(self, surface: Array, vertices: Array) -> Array:
         """(L, 3, 3): the rotations that take the parts of a neutral surface to a posed one."""
