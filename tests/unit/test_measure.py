@@ -290,7 +290,7 @@ def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_
     for name, vertices in (
         ("millimetres.obj", 1e3 * model.mean),
         ("lying.obj", model.mean[:, [0, 2, 1]]),
-        ("floating.obj", model.mean + (0.0, 0.0, 0.5)),
+        ("floating.obj", model.mean + np.array([0.0, 0.0, 0.5])),
     ):
         (tmp_path / name).write_bytes(obj_mesh(vertices, model))
     for source, words in (
