@@ -10,18 +10,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
+from station.depth.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
 from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.measure.body import measure_body, measure_standing
-from workers.scape.fit import FitResult, Method, fit_body, sampling_of
-from workers.scape.intersections import untangled
+from workers.scape.deformation import vertex_normals
+from workers.scape.fit import FitResult, Method, fit_body
 from workers.scape.model import BodyModel, load_model
 from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
-from workers.scape.verdict import Verdict
 from workers.stopwatch import Stopwatch
 
 Progress = Callable[[str, float], None]
@@ -39,17 +41,26 @@ class JobSummary:
 
 def warm_up() -> BodyModel:
     """Load everything that the first job would otherwise wait for."""
-    from station.depth.average import warm_up as compile_average
-
     model = load_model()
-    sampling_of(model)
-    untangled(model, model.mean, model.mean)
+    compile_preprocessing()
+    fit = fit_body(model, Preprocessed(_mean_cloud(model), (), ()))
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
-    compile_average()
     measured = measure_body(model, model.mean)
-    preview(model.mean, model.faces, measured.rows, Verdict("ok", ()))
+    preview(model.mean, model.faces, measured.rows, fit.verdict)
     return model
+
+
+def _mean_cloud(model: BodyModel) -> PointCloud:
+    """The mean body as a scanner would give it."""
+    count = model.vertex_count
+    return PointCloud(
+        model.mean,
+        vertex_normals(model.mean, model.faces),
+        np.full(count, 1e-3),
+        np.zeros(count, np.int16),
+        ("mean",),
+    )
 
 
 def reconstruct_bundle(

@@ -118,8 +118,3 @@ def _median(values, order):  # type: ignore[no-untyped-def]  # pragma: no cover
             order[j] = value
             valid += 1
     return np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])
-
-
-def warm_up() -> None:
-    """Compile (or load from the cache) what the first scan would otherwise wait for."""
-    average(np.zeros((3, 2, 2), np.uint16), 1e-4)

@@ -101,6 +101,13 @@ class Preprocessed:
     findings: tuple[Finding, ...]
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) what the first scan would otherwise wait for."""
+    average(np.zeros((3, 2, 2), np.uint16), 1e-4)
+    nothing = np.zeros((1, 1, 3), np.float32)
+    within(nothing, nothing[..., 0], np.eye(4), np.zeros(3), np.zeros(3))
+
+
 @dataclass(frozen=True, slots=True)
 class _Camera:
     """One camera's surface points inside the volume, flat."""

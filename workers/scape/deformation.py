@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from cholespy import CholeskySolverD, MatrixType
 from numpy.typing import NDArray
 
-from workers.scape.kernels import area_vectors, edge_pulls, summed_at_corners
+from workers.scape import kernels
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -23,6 +23,18 @@ _PINNED = 0
 """A Laplacian leaves the translation free: this vertex stays where the input has it."""
 _COLUMNS_AT_ONCE = 16
 """More right-hand sides at once fall out of the processor's cache."""
+
+
+def area_vectors(vertices: Array, faces: Faces) -> Array:
+    """Normals of the triangles, (K, 3), as long as twice their areas.
+
+    Raises:
+        IndexError: a triangle names a vertex that is not there.
+    """
+    # Compiled loops look at no bounds.
+    if int(faces.max(initial=-1)) >= len(vertices):
+        raise IndexError(f"triangles name vertex {faces.max()}; there are {len(vertices)}")
+    return np.asarray(kernels.area_vectors(vertices, faces))
 
 
 def triangle_areas(vertices: Array, faces: Faces) -> Array:
@@ -44,7 +56,7 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
-    normals = summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
+    normals = kernels.summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
@@ -124,4 +136,4 @@ class EdgeSolver:
     def carried(self, surface: Array, matrices: Array) -> Array:
         """Vertices (P, 3) whose edges come nearest to a surface's (P, 3), those of each triangle
         multiplied by its matrix (K, 3, 3); vertex 0 at the origin."""
-        return self.solve(edge_pulls(surface, self.faces, matrices, self.triangle_weights))
+        return self.solve(kernels.edge_pulls(surface, self.faces, matrices, self.triangle_weights))

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from workers.scape.crossings import crossing_pairs
-from workers.scape.deformation import Faces, vertex_normals
-from workers.scape.kernels import area_vectors
+from workers.scape.deformation import Faces, area_vectors, vertex_normals
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]

@@ -213,11 +213,14 @@ def fit_jointly(
             derivative = beside.submit(
                 sampling.body.first(stage.samples).jacobian, state, stage.components
             )
-            terms = _data_terms(model, target, followers, probed, cameras, skin, stage, observer)
+            terms = _data_terms(model, target, followers, probed, cameras, skin, stage)
+            if observer is not unobserved:
+                drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
+                observer("correspondences", {"vertices": model.vertices(state), **drawn})
             state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
             progress((step + 1) / len(schedule))
     assert terms is not None
-    return JointResult(state, cameras, model.vertices(state), terms.correspondences, len(schedule))
+    return JointResult(state, cameras, model.vertices(state), len(terms.on_body), len(schedule))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +231,10 @@ class _DataTerms:
     """(n, 3)."""
     cameras: CameraTerms | None
     """None while the corrections are kept."""
-    correspondences: int
+    on_body: Array
+    """(m, 3): one end of each correspondence."""
+    on_cloud: Array
+    """(m, 3): the other."""
 
 
 def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -247,7 +253,6 @@ def _data_terms(
     cameras: CameraCorrections,
     skin: Skin,
     stage: Stage,
-    observer: Observer,
 ) -> _DataTerms:
     """Correspondences, floor and outlines, summed up at the samples."""
     cloud = target.tree
@@ -264,8 +269,6 @@ def _data_terms(
     point = np.concatenate([pulled[asking], found])
     on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
-    seen = {"vertices": skin.positions, "on_body": on_body, "on_cloud": on_cloud}
-    observer("correspondences", seen)
     direction = skin.normals[place]
     residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
@@ -281,7 +284,7 @@ def _data_terms(
                 pairs, derivative, camera, len(cameras), skin, stage.samples
             )
     weight, pull = Rows.joined(*rows).at_samples(skin, stage.samples)
-    return _DataTerms(weight, pull, camera_terms, len(place))
+    return _DataTerms(weight, pull, camera_terms, on_body, on_cloud)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from station.depth import PointCloud
 from workers.scape.correspondence import Followers
-from workers.scape.deformation import vertex_normals
-from workers.scape.kernels import area_vectors, conjugate_gradients
+from workers.scape.deformation import area_vectors, vertex_normals
+from workers.scape.kernels import conjugate_gradients
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
