@@ -122,8 +122,8 @@ def _finish(
     watch.seconds.update(fit.seconds)
     progress("measuring", 0.0)
     with watch.step("measure"):
-        measured = measure_body(model, fit.vertices, fit.vertex_sigma_m)
-        standing = measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
+        measured = measure_body(model, fit.overlapping, fit.vertex_sigma_m)
+        standing = measure_standing(model, fit.overlapping, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
     write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

@@ -60,6 +60,9 @@ class FitResult:
     state: BodyState
     vertices: Array
     """(P, 3): the surface, world frame, metres."""
+    overlapping: Array
+    """(P, 3): the same before limbs that press into each other were taken apart: each with all its
+    flesh, as a tape finds it around a limb that is held away."""
     cloud: PointCloud
     """What the surface was laid on: the scan's, its cameras corrected."""
     vertex_sigma_m: Array
@@ -121,6 +124,7 @@ def _fit(
         )
         used = int(np.isfinite(surface.residual_m).sum())
         cameras = CameraCorrections.build(cloud, scan.views)
+        overlapping = surface.vertices
         fitted = finished = time.monotonic()
     else:
         joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
@@ -131,7 +135,8 @@ def _fit(
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         surface = fit_surface(model, joint.vertices, cloud)
-        free = untangled(model, surface.vertices, joint.vertices)
+        overlapping = surface.vertices
+        free = untangled(model, overlapping, joint.vertices)
         surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
@@ -147,6 +152,7 @@ def _fit(
     return FitResult(
         state=state,
         vertices=delivered,
+        overlapping=np.round(overlapping, 7),
         cloud=cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
