@@ -19,7 +19,9 @@ _ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
 _SWINGS_DEG = (-25.0, 0.0, 25.0)
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
-_TRIM_M = 0.08
+_CLOUD_TRIM_M = 0.48
+"""Points of an arm that hangs at the wrong angle must tell: a hand is off by that much."""
+_BODY_TRIM_M = 0.08
 _STATURE_COMPONENTS = 40
 """The first ones hold nearly all of it, and fewer are quicker to evaluate."""
 
@@ -119,8 +121,8 @@ def _costs(bodies: Array, points: Array) -> Array:
     found = trimmed_costs(
         np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
         points.astype(np.float32),
-        2 * _TRIM_M,
-        _TRIM_M,
+        _CLOUD_TRIM_M,
+        _BODY_TRIM_M,
         1.0,
     )
     return np.asarray(found)
