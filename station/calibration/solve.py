@@ -277,8 +277,9 @@ def _check_pairs(
         raise CalibrationError(
             "no two cameras saw the ball at one time: wave it where several of them see it"
         )
-    _check_clocks(clocks.large_jump({name: own.track for name, own in detections.items()}, pairs))
-    moved = clocks.moved_camera(pairs)
+    tracks = {name: own.track for name, own in detections.items()}
+    _check_clocks(clocks.large_jump(tracks, pairs))
+    moved = clocks.moved_camera(tracks, pairs)
     if moved is not None:
         raise CalibrationError(
             f"camera {moved} was moved while the ball was waved: fix it, and wave the ball again"
