@@ -150,7 +150,7 @@ def test_it_can_be_reported_and_read_again(
         assert found.cameras[name].depth_correction == camera.depth_correction
         assert camera.covariance is not None
         assert np.linalg.eigvalsh(camera.covariance).min() > 0
-    assert len(solution.summary()) >= 5
+    assert len(solution.summary()) >= 6
     assert set(solution.report["cameras"]) == set(solution.rig.cameras)
     assert 1e-4 < solution.rig.residual_rms_m < 4e-3
 
