@@ -10,13 +10,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, Volume, preprocess
+from station.depth.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
+from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.measure.body import measure_body, measure_standing
-from workers.scape.fit import FitResult, Method, fit_body, sampling_of
-from workers.scape.intersections import untangled
+from workers.scape.deformation import vertex_normals
+from workers.scape.fit import FitResult, Method, fit_body
 from workers.scape.model import BodyModel, load_model
 from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
@@ -37,16 +41,26 @@ class JobSummary:
 
 def warm_up() -> BodyModel:
     """Load everything that the first job would otherwise wait for."""
-    from station.depth.average import warm_up as compile_average
-
     model = load_model()
-    sampling_of(model)
-    untangled(model, model.mean, model.mean)
+    compile_preprocessing()
+    fit = fit_body(model, Preprocessed(_mean_cloud(model), (), ()))
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
-    compile_average()
-    measure_body(model, model.mean)
+    measured = measure_body(model, model.mean)
+    preview(model.mean, model.faces, measured.rows, fit.verdict)
     return model
+
+
+def _mean_cloud(model: BodyModel) -> PointCloud:
+    """The mean body as a scanner would give it."""
+    count = model.vertex_count
+    return PointCloud(
+        model.mean,
+        vertex_normals(model.mean, model.faces),
+        np.full(count, 1e-3),
+        np.zeros(count, np.int16),
+        ("mean",),
+    )
 
 
 def reconstruct_bundle(
@@ -108,8 +122,8 @@ def _finish(
     watch.seconds.update(fit.seconds)
     progress("measuring", 0.0)
     with watch.step("measure"):
-        measured = measure_body(model, fit.vertices, fit.vertex_sigma_m)
-        standing = measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
+        measured = measure_body(model, fit.overlapping, fit.vertex_sigma_m)
+        standing = measure_standing(model, fit.overlapping, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
     write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

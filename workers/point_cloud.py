@@ -17,6 +17,9 @@ Faces = NDArray[np.int32]
 _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
 _SIGMA_M = 0.001
+_STATURES_M = (1.0, 2.6)
+_OFF_FLOOR_M = 0.05
+"""How far a mesh's soles may be from the floor: heights are counted from there."""
 
 
 def read_cloud(path: Path, up: str) -> PointCloud:
@@ -70,7 +73,8 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
         up: "z" or "y", the axis that points up in the file.
 
     Raises:
-        InputError: the file is missing, is no mesh, holds no numbers or has other triangles.
+        InputError: the file is missing, is no mesh, holds no numbers, has other triangles, or is no
+            adult in metres who stands on the floor.
     """
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a result folder or a mesh")
@@ -83,13 +87,25 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
             f"template's {faces.max() + 1} and {len(faces)}; fit it first: "
             f"reconstruct fit --cloud {path} --up {up} --out result"
         )
-    return vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) if up == "y" else vertices
+    if up == "y":
+        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    low_m, high_m = float(vertices[:, 2].min()), float(vertices[:, 2].max())
+    if not _STATURES_M[0] < high_m - low_m < _STATURES_M[1]:
+        raise InputError(
+            f"{path} is {high_m - low_m:.4g} high with {up} up; metres were expected, or is "
+            f"another axis up? see --up"
+        )
+    if abs(low_m) > _OFF_FLOOR_M:
+        raise InputError(f"{path} has its soles at {low_m:.3f} m; move them to the floor at 0")
+    return vertices
 
 
 def _ply(path: Path) -> tuple[Array, Faces]:
     if path.suffix.lower() != ".ply":
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    mesh = o3d.io.read_triangle_mesh(path)
+    # What is wrong with a file is said once, in our own words.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(path)
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
 

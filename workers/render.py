@@ -1,4 +1,4 @@
-"""Pictures of bodies without a display: ray casting (open3d), shading in numpy, text by OpenCV."""
+"""Pictures of bodies without a display: a depth buffer, smooth shading, text by OpenCV."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
+from workers.raster import blended, nearest_triangles
 from workers.scape.deformation import vertex_normals
 
 Array = NDArray[np.float64]
@@ -27,10 +27,6 @@ TEXT_COLOR: Color = (52, 48, 46)
 _SKIN = (196.0, 208.0, 224.0)
 _LIGHT = np.array([0.35, -0.35, 0.87])
 _AWAY_M = 4.0
-_EDGE_M = 0.025
-"""A step in depth that shows as an edge, which is smoothed."""
-_SUBPIXELS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-_BLOCK = 6
 _FONT = "sans"
 
 
@@ -64,20 +60,6 @@ class Frame:
         """How far from the camera's plane points (n, 3) are, (n,) metres."""
         return (points - np.array(self.center)) @ self.forward + _AWAY_M
 
-    def rays(self, pixels: Array) -> NDArray[np.float32]:
-        """Rays (n, 6) through picture points (n, 2)."""
-        u = (pixels[:, 0] - 0.5 * (self.width - 1)) * self.meters_per_pixel
-        v = (0.5 * (self.height - 1) - pixels[:, 1]) * self.meters_per_pixel
-        rays = np.empty((len(pixels), 6), np.float32)
-        rays[:, :3] = (
-            np.array(self.center)
-            - _AWAY_M * self.forward
-            + u[:, None] * self.right
-            + v[:, None] * np.array([0.0, 0.0, 1.0])
-        )
-        rays[:, 3:] = self.forward
-        return rays
-
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
@@ -94,10 +76,6 @@ class Scene:
         """Vertices (P, 3), z up, and faces (K, 3), counter-clockwise seen from outside."""
         self._vertices, self._faces = vertices, faces
         self._normals = vertex_normals(vertices, faces)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-        )
 
     def render(self, frame: Frame, colors: Array | None = None) -> Rendering:
         """The mesh as a frame shows it, with smooth edges.
@@ -105,66 +83,15 @@ class Scene:
         Args:
             colors: (K, 3) of the triangles, blue, green and red up to 255; skin by default.
         """
-        shape = (frame.height, frame.width)
-        color = np.full((frame.height * frame.width, 3), float(BACKGROUND))
-        depth = np.full(frame.height * frame.width, np.inf, np.float32)
-        near = np.flatnonzero(_near(frame.pixels(self._vertices), self._faces, shape))
-        color[near], depth[near] = self._seen(frame, _centers(near, frame.width), colors)
-        edges = _edges(depth.reshape(shape))
-        if len(edges):
-            centers = _centers(edges, frame.width)
-            around = np.concatenate([centers + np.array(aside) for aside in _SUBPIXELS])
-            mixed, _ = self._seen(frame, around, colors)
-            color[edges] = mixed.reshape(len(_SUBPIXELS), -1, 3).mean(axis=0)
-        picture = np.clip(color + 0.5, 0, 255).astype(np.uint8)
-        return Rendering(picture.reshape(*shape, 3), depth.reshape(shape))
-
-    def _seen(
-        self, frame: Frame, pixels: Array, colors: Array | None
-    ) -> tuple[Array, NDArray[np.float32]]:
-        """What is seen at picture points (n, 2): colours (n, 3) and depths (n,)."""
-        found = self._scene.cast_rays(o3d.core.Tensor(frame.rays(pixels)))
-        depth = found["t_hit"].numpy()
-        hit = np.flatnonzero(np.isfinite(depth))
-        triangle = found["primitive_ids"].numpy().ravel()[hit]
-        uv = found["primitive_uvs"].numpy()[hit].astype(np.float64)
-        share = np.stack([1.0 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
-        normal = np.einsum("nk,nki->ni", share, self._normals[self._faces[triangle]])
-        normal /= np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None] + 1e-12
-        headlight = np.abs(normal @ frame.forward)
-        shade = 0.34 + 0.46 * headlight + 0.20 * np.clip(normal @ _LIGHT, 0.0, 1.0)
-        own = np.array(_SKIN) if colors is None else colors[triangle]
-        color = np.full((len(pixels), 3), float(BACKGROUND))
-        color[hit] = shade[:, None] * own
-        return color, depth
-
-
-def _centers(flat: NDArray[np.intp], width: int) -> Array:
-    return np.stack([flat % width, flat // width], axis=1).astype(np.float64)
-
-
-def _near(pixels: Array, faces: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (h, w) that a triangle can cover, and some more: no ray is cast at the others."""
-    corners = [pixels[faces[:, i]] for i in range(3)]
-    sides = [(corners[i], corners[i - 1]) for i in range(3)]
-    # A triangle's vertices and its sides' middles: no point of it lies farther from all of them.
-    farthest = 0.5 * float(max(np.abs(start - end).max() for start, end in sides))
-    marks = np.concatenate([pixels, *(0.5 * (start + end) for start, end in sides)])
-    height, width = -(-shape[0] // _BLOCK), -(-shape[1] // _BLOCK)
-    blocks = np.zeros((height, width), np.uint8)
-    u, v = np.floor_divide(marks, _BLOCK).astype(int).T
-    blocks[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = 1
-    reach = 2 * int(np.ceil(farthest / _BLOCK)) + 1
-    blocks = cv2.dilate(blocks, np.ones((reach, reach), np.uint8)).astype(np.uint8)
-    return np.kron(blocks, np.ones((_BLOCK, _BLOCK), bool))[: shape[0], : shape[1]] > 0
-
-
-def _edges(depth: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Flat indices of pixels beside which the depth steps."""
-    near = np.where(np.isfinite(depth), depth, 10.0 * _AWAY_M).astype(np.float32)
-    kernel = np.ones((3, 3), np.uint8)
-    step = cv2.dilate(near, kernel) - cv2.erode(near, kernel)
-    return np.flatnonzero(step.ravel() > _EDGE_M)
+        headlight = np.abs(self._normals @ frame.forward)
+        shade = 0.34 + 0.46 * headlight + 0.20 * np.clip(self._normals @ _LIGHT, 0.0, 1.0)
+        u, v = frame.pixels(self._vertices).T
+        depth = frame.depths(self._vertices)
+        nearest, triangle, shown = nearest_triangles(
+            u, v, depth, shade, self._faces, frame.height, frame.width
+        )
+        own = np.array([_SKIN]) if colors is None else np.asarray(colors, np.float64)
+        return Rendering(*blended(nearest, triangle, shown, own, float(BACKGROUND)))
 
 
 def render_mesh(

@@ -58,21 +58,21 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
     for y in range(height):
         for x in range(width):
             valid = 0
+            lowest, highest = np.float32(np.inf), np.float32(0.0)
             for i in range(frames):
                 value = stack[i, y, x] * scale
                 values[i] = value
                 if value > 0.0:
-                    j = valid
-                    while j > 0 and order[j - 1] > value:
-                        order[j] = order[j - 1]
-                        j -= 1
-                    order[j] = value
                     valid += 1
+                    lowest = min(lowest, value)
+                    highest = max(highest, value)
             if valid < least:
                 continue
-            median = np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])
-            square = median * median
-            gate = _GATE_SIGMAS * RANDOM_SIGMA * square + STEP * square
+            # Where even the extremes agree, so does everything with the median, whatever it is.
+            median, gate = lowest, np.float32(np.inf)
+            if highest - lowest > _gate(lowest):
+                median = _median(values, order)
+                gate = _gate(median)
             total = np.float32(0.0)
             kept = 0
             early = np.float32(0.0)
@@ -100,6 +100,21 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
                 change[y, x] = late / late_count - early / early_count
 
 
-def warm_up() -> None:
-    """Compile (or load from the cache) what the first scan would otherwise wait for."""
-    average(np.zeros((3, 2, 2), np.uint16), 1e-4)
+@numba.njit(cache=True, nogil=True, inline="always")
+def _gate(depth):  # type: ignore[no-untyped-def]  # pragma: no cover
+    return np.float32(_GATE_SIGMAS * RANDOM_SIGMA + STEP) * depth * depth
+
+
+@numba.njit(cache=True, nogil=True)
+def _median(values, order):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Of those above zero; order is room to sort them in."""
+    valid = 0
+    for value in values:
+        if value > 0.0:
+            j = valid
+            while j > 0 and order[j - 1] > value:
+                order[j] = order[j - 1]
+                j -= 1
+            order[j] = value
+            valid += 1
+    return np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,6 +58,33 @@ def project(camera: CameraCalibration, points: NDArray[np.float64]) -> NDArray[n
 def camera_points(camera: CameraCalibration, depth_m: Image) -> Image:
     """(h, w, 3) points in the camera frame; zeros where there is no reading."""
     return rays(camera) * depth_m[..., None]
+
+
+@numba.njit(cache=True, nogil=True)
+def within(rays_, depth_m, world_from_camera, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(h, w): readings whose points lie in a box of the world.
+
+    Args:
+        rays_: (h, w, 3), as `rays` gives them.
+        depth_m: (h, w), 0 = no reading.
+        world_from_camera: (4, 4).
+        low, high: (3,): the box' corners, metres.
+    """
+    height, width = depth_m.shape
+    out = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            depth = depth_m[y, x]
+            if not depth > 0.0:
+                continue
+            inside = True
+            for i in range(3):
+                place = world_from_camera[i, 3]
+                for k in range(3):
+                    place += world_from_camera[i, k] * rays_[y, x, k] * depth
+                inside = inside and low[i] < place < high[i]
+            out[y, x] = inside
+    return out
 
 
 def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from station.bundle import Bundle
 from station.calibration.rig import CameraCalibration
 from station.depth.average import average, random_sigma_m
 from station.depth.people import count_people
-from station.depth.points import Image, camera_points, jumps, normals
+from station.depth.points import Image, camera_points, jumps, normals, rays, within
 from station.errors import InputError
 
 Array = NDArray[np.float64]
@@ -100,6 +101,13 @@ class Preprocessed:
     findings: tuple[Finding, ...]
 
 
+def warm_up() -> None:
+    """Compile (or load from the cache) what the first scan would otherwise wait for."""
+    average(np.zeros((3, 2, 2), np.uint16), 1e-4)
+    nothing = np.zeros((1, 1, 3), np.float32)
+    within(nothing, nothing[..., 0], np.eye(4), np.zeros(3), np.zeros(3))
+
+
 @dataclass(frozen=True, slots=True)
 class _Camera:
     """One camera's surface points inside the volume, flat."""
@@ -129,32 +137,27 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
     names = [name for name, frames in bundle.frames.items() if frames]
     with ThreadPoolExecutor(max_workers=2) as pool:
         cameras = list(pool.map(lambda name: _camera(bundle, name, volume), names))
-    kept, findings = _one_person([camera.points for camera in cameras])
-    views, clouds = [], []
-    expected = max(max(camera.frames, camera.ordered) for camera in cameras)
-    for name, camera, keep in zip(names, cameras, kept, strict=True):
-        view, cloud = _cleaned(camera, keep)
-        views.append(view)
-        clouds.append(cloud)
-        findings += _camera_findings(name, camera, keep, expected)
+        kept, findings = _one_person([camera.points for camera in cameras])
+        expected = max(max(camera.frames, camera.ordered) for camera in cameras)
+        cleaned = pool.map(_cleaned, cameras, kept)
+        noticed = pool.map(partial(_camera_findings, expected), names, cameras, kept)
+        views, clouds = zip(*cleaned, strict=True)
+        findings += [finding for of_camera in noticed for finding in of_camera]
     findings += [
         Finding("camera-blind", name, None, f"camera {name} gave no frame; check it")
         for name in bundle.rig.cameras
         if name not in names
     ]
-    return Preprocessed(_merged(names, clouds), tuple(views), tuple(findings))
+    return Preprocessed(_merged(names, clouds), views, tuple(findings))
 
 
 def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     calibration = bundle.rig.cameras[name]
     averaged = average(bundle.depth_stack(name), bundle.depth_scale_m)
     depth = calibration.depth_correction.apply(averaged.depth_m).astype(np.float32)
-    pose = calibration.world_from_camera
-    near = _in_volume(camera_points(calibration, depth), depth, pose, volume)
+    near = _in_volume(calibration, depth, volume)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    restless = _in_volume(
-        camera_points(calibration, averaged.unsettled_m), averaged.unsettled_m, pose, volume
-    )
+    restless = _in_volume(calibration, averaged.unsettled_m, volume)
     unsettled = float(restless.sum() / max(1, (near | restless).sum()))
     if not len(rows):
         nothing = np.empty((0, 3))
@@ -188,6 +191,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     readings = averaged.count[window][valid].astype(np.float64)
     sigma = random_sigma_m(smooth[valid].astype(np.float64)) / np.sqrt(readings * cosine[valid])
     local = points[valid].astype(np.float64)
+    pose = calibration.world_from_camera
     return _Camera(
         calibration=calibration,
         depth_m=np.where(image > 0, image, depth),
@@ -207,12 +211,11 @@ def _ordered(bundle: Bundle, name: str) -> int:
     return min(max(numbers) - min(numbers) + 1, _PLENTY_OF_FRAMES)
 
 
-def _in_volume(points: Image, depth: Image, pose: Array, volume: Volume) -> Mask:
-    world = points @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
-    low = np.array(volume.min_m, np.float32)
+def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -> Mask:
+    low = np.array(volume.min_m)
     low[2] = max(low[2], volume.floor_clearance_m)
-    inside = (world > low) & (world < np.array(volume.max_m, np.float32))
-    return np.asarray(inside.all(axis=-1) & (depth > 0))
+    pose = calibration.world_from_camera
+    return within(rays(calibration), depth_m, pose, low, np.array(volume.max_m))
 
 
 def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
@@ -225,10 +228,11 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
         )
     low = everything.min(axis=0) - 2 * _VOXEL_M
     cells = ((everything - low) / _VOXEL_M).astype(np.int64)
-    occupied = np.zeros(cells.max(axis=0) + 3, np.int32)
-    np.add.at(occupied, tuple(cells.T), 1)
+    shape = tuple(cells.max(axis=0) + 3)
+    cell = np.ravel_multi_index(tuple(cells.T), shape)
+    occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
     labels, count = ndimage.label(ndimage.binary_dilation(occupied >= 3))
-    of_point = labels[tuple(cells.T)]
+    of_point = labels.ravel()[cell]
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
     main = int(np.argmax(sizes))
@@ -262,7 +266,7 @@ def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Arra
     return view, (camera.points[keep], camera.normals[keep], camera.sigma_m[keep])
 
 
-def _merged(names: list[str], clouds: list[tuple[Array, Array, Array]]) -> PointCloud:
+def _merged(names: list[str], clouds: Sequence[tuple[Array, Array, Array]]) -> PointCloud:
     sizes = [len(points) for points, _, _ in clouds]
     return PointCloud(
         points=np.concatenate([points for points, _, _ in clouds]),
@@ -273,7 +277,7 @@ def _merged(names: list[str], clouds: list[tuple[Array, Array, Array]]) -> Point
     )
 
 
-def _camera_findings(name: str, camera: _Camera, keep: Mask, expected: int) -> list[Finding]:
+def _camera_findings(expected: int, name: str, camera: _Camera, keep: Mask) -> list[Finding]:
     found = []
     if not keep.any():
         message = f"camera {name} sees nothing of the person; check that it is not covered"

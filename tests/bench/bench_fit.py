@@ -124,7 +124,7 @@ def nricp(model: BodyModel, scan: Preprocessed) -> Array:
     """trimesh's non-rigid ICP (Amberg et al. 2007) from the same start on the same cloud."""
     cloud = scan.cloud
     every = slice(None, None, max(1, len(cloud) // 20_000))
-    scout, _ = sampling_of(model).stage(250)
+    scout = sampling_of(model).body.first(250)
     start = model.vertices(starting_states(model, scout, cloud.points[:: len(cloud) // 800])[0])
     target = trimesh.PointCloud(cloud.points[every])
     source = trimesh.Trimesh(start, model.faces, process=False)

@@ -148,8 +148,8 @@ def calibrate(model: BodyModel, scans: Sequence[Scan], out: Path) -> None:
     found: dict[Pose, dict[str, tuple[list[float], list[float]]]] = {pose: {} for pose in POSES}
     for scan in scans:
         fit = scan.fit
-        standing = stood_upright(model, fit.vertices, fit.state)
-        for pose, vertices in zip(POSES, (fit.vertices, standing), strict=True):
+        standing = stood_upright(model, fit.overlapping, fit.state)
+        for pose, vertices in zip(POSES, (fit.overlapping, standing), strict=True):
             truth = scan.truth[pose]
             for trace in trace_all(model, vertices):
                 name = trace.definition.name
@@ -300,9 +300,9 @@ def measured_in(
     for scan in scans:
         fit = scan.fit
         start_s = time.perf_counter()
-        bodies["as-scanned"].append(measure_body(model, fit.vertices, fit.vertex_sigma_m))
+        bodies["as-scanned"].append(measure_body(model, fit.overlapping, fit.vertex_sigma_m))
         bodies["standard"].append(
-            measure_standing(model, fit.vertices, fit.state, fit.vertex_sigma_m)
+            measure_standing(model, fit.overlapping, fit.state, fit.vertex_sigma_m)
         )
         seconds.append(time.perf_counter() - start_s)
     return bodies, float(np.median(seconds))

@@ -22,7 +22,7 @@ from workers.measure.cli import measure
 from workers.measure.definitions import DEFINITIONS, Route, Section
 from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
 from workers.measure.sections import loop_length
-from workers.measure.standing import on_both_feet, standard_state
+from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, BodyState, load_model
@@ -153,6 +153,19 @@ def test_standing_takes_the_scanned_pose_away(model: BodyModel) -> None:
         assert tables[1][name] == pytest.approx(value, abs=0.006), name
 
 
+def test_what_standing_adds_on_the_average_is_taken_off(model: BodyModel) -> None:
+    """Necks and shoulders once came out a centimetre too wide in the standard pose."""
+    state, vertices = _body(model, 4)
+    sigma = np.full(model.vertex_count, 1e-3)
+    traces = trace_all(model, stood_upright(model, vertices, state))
+    rows = measure_standing(model, vertices, state, sigma).rows
+    for trace, row in zip(traces, rows, strict=True):
+        bias = shipped()["standard"][sides_pooled(row.name)].bias
+        assert row.value_m == pytest.approx(max(0.0, trace.value_m - bias)), row.name
+        low, high = row.interval95_m
+        assert low == 0.0 or row.value_m - low == pytest.approx(high - row.value_m), row.name
+
+
 def test_the_standard_pose(model: BodyModel) -> None:
     body = on_both_feet(model, model.vertices(standard_state(model, np.zeros(model.beta_count))))
     at = {name: body[index] for name, index in model.landmarks.items()}
@@ -266,12 +279,24 @@ def test_a_results_tables_are_printed_with_their_intervals(
     assert all(float(row["low"]) < float(row["value"]) < float(row["high"]) for row in rows[:9])
     assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
     assert "s1, pose as-scanned" in _run(str(tmp_path))
+    both = CliRunner().invoke(measure, [str(tmp_path), "--json", "--csv"])
+    assert both.exit_code == 2
+    assert "not both" in both.output
 
 
 def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_path: Path) -> None:
     (tmp_path / "cut.ply").write_bytes(ply_mesh(model.mean, model.faces[:-5]))
     (tmp_path / "text.obj").write_text("v one two three\n")
+    for name, vertices in (
+        ("millimetres.obj", 1e3 * model.mean),
+        ("lying.obj", model.mean[:, [0, 2, 1]]),
+        ("floating.obj", model.mean + np.array([0.0, 0.0, 0.5])),
+    ):
+        (tmp_path / name).write_bytes(obj_mesh(vertices, model))
     for source, words in (
+        ("millimetres.obj", "metres were expected"),
+        ("lying.obj", "another axis up"),
+        ("floating.obj", "soles at 0.5"),
         ("cut.ply", "fit it first"),
         ("text.obj", "no usable mesh"),
         ("missing.ply", "not a file"),

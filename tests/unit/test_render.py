@@ -60,6 +60,19 @@ def test_triangles_take_their_colours() -> None:
     assert picture[10, 10, 0] > 150 > 10 > picture[10, 10, 2]
 
 
+def test_what_is_in_front_hides_what_is_behind() -> None:
+    """Whatever the order of the triangles and whichever way they turn."""
+    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 0, 2], [-1, 0, 2]])
+    vertices = np.concatenate([square, 0.5 * square + (0.0, -0.3, 0.5)])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], np.int32)
+    frame = Frame("front", 50, 50, 0.05, (0.0, 0.0, 1.0))
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0]):
+        shown = Scene(vertices, faces[order]).render(frame)
+        assert shown.depth_m[25, 25] == pytest.approx(frame.depths(vertices[4:5])[0])
+        assert shown.depth_m[10, 10] == pytest.approx(frame.depths(vertices[:1])[0])
+        assert np.isinf(shown.depth_m[2, 2])
+
+
 def _decoded(content: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
 

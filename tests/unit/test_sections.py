@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from station.drivers.virtual_scene import sphere
 from workers.measure.sections import (
@@ -49,6 +50,25 @@ def test_a_tape_spans_hollows() -> None:
     tape = points[hull_order(points, UP)]
     assert loop_length(tape, closed=True) < loop_length(points, closed=True) - 0.005
     assert loop_length(tape, closed=True) == pytest.approx(2 * np.pi * 0.1, rel=0.02)
+
+
+@pytest.mark.parametrize("digits", [1, 9])
+def test_a_tape_is_as_long_as_the_convex_hull(digits: int) -> None:
+    """Many points on one line or in one place, as a mesh's sections have them, change nothing."""
+    rng = np.random.default_rng(digits)
+    for count in range(4, 60):
+        points = np.zeros((count, 3))
+        points[:, :2] = rng.standard_normal((count, 2)).round(digits)
+        tape = points[hull_order(points, UP)]
+        assert loop_length(tape, closed=True) == pytest.approx(ConvexHull(points[:, :2]).area)
+
+
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 3)), np.ones((5, 3)), np.arange(12.0).reshape(4, 3)]
+)
+def test_a_tape_around_nothing_is_refused(points: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="does not cut"):
+        hull_order(points, UP)
 
 
 def test_a_tape_over_a_sphere() -> None:

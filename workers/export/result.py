@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -44,16 +46,19 @@ def write_result(
     """
     with watch.step("export"):
         faces = model.faces
-        files = {
-            "mesh.ply": ply_mesh(fit.vertices, faces),
-            "mesh.obj": obj_mesh(fit.vertices, model),
-            "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
-            "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
-            "cloud.ply": ply_cloud(cloud.points, cloud.normals),
-            "measurements.json": _json(measurements_document(scan_id, measured)),
-            STANDARD_POSE_FILE: _json(measurements_document(scan_id, standing)),
-            "preview.png": preview(fit.vertices, faces, measured.rows, fit.verdict),
-        }
+        # Drawing leaves the interpreter's lock alone: it goes on beside the other files.
+        with ThreadPoolExecutor(1) as beside:
+            picture = beside.submit(preview, fit.vertices, faces, measured.rows, fit.verdict)
+            files = {
+                "mesh.ply": ply_mesh(fit.vertices, faces),
+                "mesh.obj": obj_mesh(fit.vertices, model),
+                "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
+                "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
+                "cloud.ply": ply_cloud(cloud.points, cloud.normals),
+                "measurements.json": _json(measurements_document(scan_id, measured)),
+                STANDARD_POSE_FILE: _json(measurements_document(scan_id, standing)),
+                "preview.png": picture.result(),
+            }
         for name, content in files.items():
             (folder / name).write_bytes(content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
@@ -135,12 +140,32 @@ def result_document(
         "versions": {
             "body-booth": __version__,
             "python": platform.python_version(),
-            **{name: metadata.version(name) for name in _LIBRARIES},
+            **_library_versions(),
         },
         "files": hashes,
     }
 
 
+@lru_cache(maxsize=1)
+def _library_versions() -> dict[str, str]:
+    """They cannot change while the program runs."""
+    return {name: metadata.version(name) for name in _LIBRARIES}
+
+
 def _json(document: dict[str, Any]) -> bytes:
-    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
-    return (text + "\n").encode()
+    """An entry a line, a table's row a line: people can read it, and it is quick to write."""
+    entries = ",\n".join(f" {_compact(key)}: {_lines(value)}" for key, value in document.items())
+    return f"{{\n{entries}\n}}\n".encode()
+
+
+def _lines(value: Any) -> str:
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n  " + ",\n  ".join(_compact(row) for row in value) + "\n ]"
+    if isinstance(value, dict) and value:
+        rows = (f"{_compact(key)}: {_compact(row)}" for key, row in value.items())
+        return "{\n  " + ",\n  ".join(rows) + "\n }"
+    return _compact(value)
+
+
+def _compact(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.measure.intervals import Pose, content_interval, intervals
+from workers.measure.intervals import Pose, content_interval, intervals, row_values
 from workers.measure.sections import enclosed_volume
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import trace_all
@@ -87,12 +87,14 @@ def _measured(
         Measurement(
             trace.definition.name,
             trace.definition.standard,
-            trace.value_m,
+            value,
             interval,
             trace.path(shown),
             trace.closed,
         )
-        for trace, interval in zip(traces, intervals(traces, vertex_sigma_m, pose), strict=True)
+        for trace, value, interval in zip(
+            traces, row_values(traces, pose), intervals(traces, vertex_sigma_m, pose), strict=True
+        )
     )
     volume = enclosed_volume(vertices, model.faces)
     surface = float(triangle_areas(vertices, model.faces).sum())

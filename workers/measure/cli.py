@@ -12,6 +12,9 @@ import click
 
 from station.errors import FormatError, InputError
 
+_DIGITS = 5
+"""Of a table: hundredths of a millimetre, far below any interval."""
+
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
@@ -37,6 +40,8 @@ def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> No
       reconstruct measure result --pose standard --csv > standard.csv
       reconstruct measure mesh.ply --json
     """
+    if as_json and as_csv:
+        raise click.UsageError("--json or --csv, not both")
     document = _of_result(source, pose) if source.is_dir() else _of_mesh(source, pose, up)
     if as_json:
         click.echo(json.dumps(document))
@@ -93,9 +98,11 @@ def _write_csv(document: dict[str, Any]) -> None:
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(["name", "value", "low", "high", "unit", "standard"])
     for row in document["measurements"]:
-        writer.writerow([row["name"], row["value_m"], *row["interval95_m"], "m", row["standard"]])
+        numbers = (round(number, _DIGITS) for number in (row["value_m"], *row["interval95_m"]))
+        writer.writerow([row["name"], *numbers, "m", row["standard"]])
     for name, unit, content in _contents(document):
-        writer.writerow([name, content["value"], *content["interval95"], unit, ""])
+        numbers = (round(number, _DIGITS) for number in (content["value"], *content["interval95"]))
+        writer.writerow([name, *numbers, unit, ""])
 
 
 def _print_table(document: dict[str, Any]) -> None:

@@ -116,6 +116,8 @@ HIPS = (*TRUNK, "thigh_left", "thigh_right")
 SHOULDERS = (
     "neck", "chest", "shoulder_left", "shoulder_right", "upper_arm_left", "upper_arm_right",
 )  # fmt: skip
+YOKE = tuple(part for part in SHOULDERS if part != "neck")
+"""What lies below the seventh neck vertebra: a neck that leans to one side is not in the way."""
 FLANK = (*HIPS, "shin_left", "shin_right")
 
 _CLOTHES = "ISO 8559-1:2017"
@@ -236,7 +238,7 @@ def _trunk_lengths() -> tuple[Definition, ...]:
         Definition(
             "across_back_shoulder_width",
             "shoulder point over the seventh neck vertebra to the other", "length",
-            Route(("acromion_right", "cervicale", "acromion_left"), ("tape", "tape"), SHOULDERS),
+            Route(("acromion_right", "cervicale", "acromion_left"), ("tape", "tape"), YOKE),
             f"{_CLOTHES} 5.4.3",
         ),
         _distance("across_back_width", "between the back folds of the armpits, straight",
@@ -290,8 +292,7 @@ def _arm(side: str) -> tuple[Definition, ...]:
             f"sleeve_length_{side}",
             "seventh neck vertebra over the shoulder point, then straight to elbow and wrist",
             "length",
-            Route(("cervicale", acromion, elbow, wrist), ("tape", "straight", "straight"),
-                  SHOULDERS),
+            Route(("cervicale", acromion, elbow, wrist), ("tape", "straight", "straight"), YOKE),
             f"{_CLOTHES} 5.4.17",
         ),
         _distance(f"hand_length_{side}", "wrist along the back of the middle finger to its tip",

@@ -8,14 +8,16 @@ landmarks slide along the skin from fit to fit, which it does not know. So
 sigma being the posterior standard deviation, rms along the row's line. `constant`, `gain` and the
 row's systematic error `bias` are learned from scans of held-out bodies of which the truth is known
 (conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), so that an interval holds the
-truth 95 times of 100. The bias shifts the interval alone: a value stays the length of its line.
+truth 95 times of 100. As scanned the bias shifts the interval alone: a value is the length of its
+line. In the standard pose, which no camera saw, the bias is what carrying a body there adds on the
+average, and it is taken off the value.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
@@ -143,19 +145,31 @@ def sides_pooled(name: str) -> str:
     return name.removesuffix("_left").removesuffix("_right")
 
 
+def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
+    """The value (m) of each row, never below 0."""
+    if pose == "as-scanned":
+        return [trace.value_m for trace in traces]
+    return [max(0.0, trace.value_m - _model_of(trace, pose).bias) for trace in traces]
+
+
 def intervals(
     traces: Sequence[Trace], vertex_sigma_m: Array | None, pose: Pose
 ) -> list[tuple[float, float]]:
     """The 95 % interval of each row; without a posterior the mesh itself is the truth."""
+    values = row_values(traces, pose)
     if vertex_sigma_m is None:
-        return [(trace.value_m, trace.value_m) for trace in traces]
-    models = shipped()[pose]
-    return [
-        models[sides_pooled(trace.definition.name)].interval(
-            trace.value_m, line_sigma(trace, vertex_sigma_m)
-        )
-        for trace in traces
-    ]
+        return [(value, value) for value in values]
+    found = []
+    for trace, value in zip(traces, values, strict=True):
+        model = _model_of(trace, pose)
+        if pose == "standard":
+            model = replace(model, bias=0.0)
+        found.append(model.interval(value, line_sigma(trace, vertex_sigma_m)))
+    return found
+
+
+def _model_of(trace: Trace, pose: Pose) -> ErrorModel:
+    return shipped()[pose][sides_pooled(trace.definition.name)]
 
 
 def content_interval(

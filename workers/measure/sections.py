@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -115,13 +115,37 @@ def hull_order(points: Array, normal: Array) -> Index:
         ValueError: fewer than three points, or all on a line.
     """
     x, y = plane_axes(normal)
-    if len(points) < 3:
+    u, v = points @ x, points @ y
+    tape = _chain(u, v, np.lexsort((v, u)))
+    if len(tape) < 3:
         raise ValueError("the plane does not cut this part of the body")
-    try:
-        hull = ConvexHull(np.stack([points @ x, points @ y], axis=1))
-    except QhullError:
-        raise ValueError("the plane does not cut this part of the body") from None
-    return np.asarray(hull.vertices, np.intp)
+    return np.asarray(tape, np.intp)
+
+
+@numba.njit(cache=True)
+def _chain(u, v, order):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The convex hull of points (n,), sorted by u and then v, counter-clockwise: the chain below
+    and back the chain above (Andrew 1979, Information Processing Letters 9:216)."""
+    count = len(order)
+    kept = np.empty(2 * count + 1, np.int64)
+    size = 0
+    for sweep in range(2):
+        least = size + 1
+        for step in range(count):
+            here = order[step] if sweep == 0 else order[count - 1 - step]
+            while size > least and _turn(u, v, kept[size - 2], kept[size - 1], here) <= 0.0:
+                size -= 1
+            kept[size] = here
+            size += 1
+        # The last of one chain begins the other.
+        size -= 1
+    return kept[:size]
+
+
+@numba.njit(cache=True, inline="always")
+def _turn(u, v, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Positive where a, b, c turn left."""
+    return (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
 
 
 def loop_length(points: Array, *, closed: bool) -> float:

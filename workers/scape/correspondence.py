@@ -8,10 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from workers.scape.deformation import Faces, neighbours
+from workers.scape.kernels import descend
+
 Array = NDArray[np.float64]
 
 _DIRECTION_SCALE_M = 0.04
 """How far apart two points count that face opposite ways: half of twice this."""
+_SCOUT_EVERY = 4
+_WORTH_A_THREAD = 5000
+"""Fewer questions are answered before a second thread has started."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +34,7 @@ class OrientedTree:
 
     def nearest(self, points: Array, normals: Array) -> NDArray[np.intp]:
         """Index (m,) of the neighbour of each oriented point (m, 3)."""
-        _, index = self.tree.query(_joined(points, normals), workers=2)
+        _, index = self.tree.query(_joined(points, normals), workers=_threads(len(points)))
         return np.asarray(index)
 
     def pairs(
@@ -41,7 +47,9 @@ class OrientedTree:
         turn_m = 2.0 * _DIRECTION_SCALE_M * np.sin(0.5 * max_angle_rad)
         reach_m = float(np.hypot(max_distance_m, turn_m))
         _, index = self.tree.query(
-            _joined(points, normals), distance_upper_bound=reach_m, workers=2
+            _joined(points, normals),
+            distance_upper_bound=reach_m,
+            workers=_threads(len(points)),
         )
         found = np.flatnonzero(index < len(self.points))
         index = index[found]
@@ -53,6 +61,60 @@ class OrientedTree:
             max_angle_rad=max_angle_rad,
         )
         return found[kept], index[kept]
+
+
+class Followers:
+    """Oriented points (n, 3) that keep their vertex while one surface moves beneath them.
+
+    They are searched for in the whole surface once. After that, each looks for a nearer vertex
+    among the neighbours of its last, and on from there. Dense points in the order of an image are
+    quicker: they set out from the vertex that was found for one a few places before them.
+    """
+
+    def __init__(self, faces: Faces, points: Array, normals: Array, *, dense: bool = False) -> None:
+        self.points, self.normals = points, normals
+        self._scouts = _SCOUT_EVERY if dense else 1
+        self._place = _joined(points, normals)
+        self._graph = neighbours(faces)
+        self._vertex: NDArray[np.intp] | None = None
+
+    def pairs(
+        self, vertices: Array, normals: Array, *, max_distance_m: float, max_angle_rad: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Those of the points that have a compatible vertex (P, 3), and which."""
+        limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
+        last = self._vertex
+        if last is None:
+            tree = OrientedTree.build(vertices, normals)
+            last = self._scouted(tree, limits)
+        known = np.flatnonzero(last >= 0)
+        here = descend(self._place[known], _joined(vertices, normals), *self._graph, last[known])
+        kept = compatible(
+            vertices[here] - self.points[known], self.normals[known], normals[here], **limits
+        )
+        found = np.full(len(self.points), -1, np.intp)
+        found[known[kept]] = here[kept]
+        last[known] = here
+        if self._vertex is None:
+            # Whom a scout led astray is searched for by itself.
+            lost = np.flatnonzero(found < 0)
+            again, anew = tree.pairs(self.points[lost], self.normals[lost], **limits)
+            found[lost[again]] = last[lost[again]] = anew
+            self._vertex = last
+        used = np.flatnonzero(found >= 0)
+        return used, found[used]
+
+    def _scouted(self, tree: OrientedTree, limits: dict[str, float]) -> NDArray[np.intp]:
+        """(n,): where each point sets out from, -1 where nothing was found."""
+        every = slice(None, None, self._scouts)
+        found, vertex = tree.pairs(self.points[every], self.normals[every], **limits)
+        scouted = np.full(-(-len(self.points) // self._scouts), -1, np.intp)
+        scouted[found] = vertex
+        return np.repeat(scouted, self._scouts)[: len(self.points)]
+
+
+def _threads(questions: int) -> int:
+    return 2 if questions > _WORTH_A_THREAD else 1
 
 
 def _joined(points: Array, normals: Array) -> Array:

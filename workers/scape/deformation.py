@@ -14,6 +14,8 @@ import scipy.sparse as sp
 from cholespy import CholeskySolverD, MatrixType
 from numpy.typing import NDArray
 
+from workers.scape import kernels
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
@@ -23,10 +25,21 @@ _COLUMNS_AT_ONCE = 16
 """More right-hand sides at once fall out of the processor's cache."""
 
 
+def area_vectors(vertices: Array, faces: Faces) -> Array:
+    """Normals of the triangles, (K, 3), as long as twice their areas.
+
+    Raises:
+        IndexError: a triangle names a vertex that is not there.
+    """
+    # Compiled loops look at no bounds.
+    if int(faces.max(initial=-1)) >= len(vertices):
+        raise IndexError(f"triangles name vertex {faces.max()}; there are {len(vertices)}")
+    return np.asarray(kernels.area_vectors(vertices, faces))
+
+
 def triangle_areas(vertices: Array, faces: Faces) -> Array:
     """Areas (K,) in square metres."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return np.asarray(0.5 * np.linalg.norm(area_vectors(vertices, faces), axis=1))
 
 
 def vertex_areas(vertices: Array, faces: Faces) -> Array:
@@ -43,13 +56,16 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    corners = faces.ravel()
-    normals = np.stack(
-        [np.bincount(corners, weighted[:, i], minlength=len(vertices)) for i in range(3)], axis=1
-    )
+    normals = kernels.summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
+
+
+def neighbours(faces: Faces) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices joined by an edge: where each one's begin (P + 1,), and all of them."""
+    tail = np.concatenate([faces.ravel(), np.roll(faces, -1, axis=1).ravel()])
+    head = np.concatenate([np.roll(faces, -1, axis=1).ravel(), faces.ravel()])
+    graph = sp.csr_matrix((np.ones(len(tail), bool), (tail, head)))
+    return graph.indptr, graph.indices
 
 
 def edges(vertices: Array, faces: Faces) -> Array:
@@ -116,3 +132,8 @@ class EdgeSolver:
     def vertices(self, edges_: Array) -> Array:
         """Vertices (P, 3) whose edges come nearest to (K, 3, 3), with vertex 0 at the origin."""
         return self.solve(self.incidence @ edges_.reshape(-1, 3))
+
+    def carried(self, surface: Array, matrices: Array) -> Array:
+        """Vertices (P, 3) whose edges come nearest to a surface's (P, 3), those of each triangle
+        multiplied by its matrix (K, 3, 3); vertex 0 at the origin."""
+        return self.solve(kernels.edge_pulls(surface, self.faces, matrices, self.triangle_weights))

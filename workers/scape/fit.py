@@ -46,7 +46,7 @@ Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
 _LEAST_POINTS = 1500
-_TREE_POINTS = 60_000
+_TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
@@ -60,6 +60,9 @@ class FitResult:
     state: BodyState
     vertices: Array
     """(P, 3): the surface, world frame, metres."""
+    overlapping: Array
+    """(P, 3): the same before limbs that press into each other were taken apart: each with all its
+    flesh, as a tape finds it around a limb that is held away."""
     cloud: PointCloud
     """What the surface was laid on: the scan's, its cameras corrected."""
     vertex_sigma_m: Array
@@ -109,7 +112,7 @@ def _fit(
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
-    scout, _ = sampling.stage(_SCOUT_SAMPLES)
+    scout = sampling.body.first(_SCOUT_SAMPLES)
     target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
     starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
     if observer is not unobserved:
@@ -121,6 +124,7 @@ def _fit(
         )
         used = int(np.isfinite(surface.residual_m).sum())
         cameras = CameraCorrections.build(cloud, scan.views)
+        overlapping = surface.vertices
         fitted = finished = time.monotonic()
     else:
         joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
@@ -131,7 +135,8 @@ def _fit(
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         surface = fit_surface(model, joint.vertices, cloud)
-        free = untangled(model, surface.vertices, joint.vertices)
+        overlapping = surface.vertices
+        free = untangled(model, overlapping, joint.vertices)
         surface = replace(surface, vertices=free)
         finished = time.monotonic()
     observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
@@ -147,6 +152,7 @@ def _fit(
     return FitResult(
         state=state,
         vertices=delivered,
+        overlapping=np.round(overlapping, 7),
         cloud=cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,

@@ -6,6 +6,7 @@ For hair, dark cloth and flanks that give no reading it is the only evidence tha
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -56,7 +57,9 @@ class FreeSpace:
 
     @classmethod
     def build(cls, views: Sequence[CameraView]) -> FreeSpace:
-        return cls(tuple(_view(view) for view in views if view.background.any()))
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            found = pool.map(_view, (view for view in views if view.background.any()))
+            return cls(tuple(found))
 
     def intrusions(self, vertices: Array) -> Intrusions:
         """The vertices (P, 3) among which a camera saw the booth behind, once a camera."""

@@ -6,6 +6,7 @@ prior, against the points beyond the wrist; everything else of the body stays wh
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,11 +89,18 @@ def place_hands(
 ) -> BodyState:
     """The state with both hands turned and closed as the points beyond the wrists say."""
     tree = OrientedTree.build(vertices, normals)
-    for hand in hands:
+
+    def searched(hand: Hand) -> BodyState:
         points, directions = _beyond_wrist(model, hand, cloud, vertices, tree)
-        if len(points) >= _LEAST_POINTS:
-            state = _searched(model, hand, state, normals, points, directions)
-    return state
+        if len(points) < _LEAST_POINTS:
+            return state
+        return _searched(model, hand, state, normals, points, directions)
+
+    rotations = state.rotations.copy()
+    with ThreadPoolExecutor(max_workers=len(hands)) as pool:
+        for hand, found in zip(hands, pool.map(searched, hands), strict=True):
+            rotations[list(hand.parts)] = found.rotations[list(hand.parts)]
+    return replace(state, rotations=rotations)
 
 
 def _beyond_wrist(
@@ -126,11 +134,10 @@ def _searched(
     points: Array,
     directions: Array,
 ) -> BodyState:
-    start = model.relative_twists(state.rotations)[list(hand.parts)].ravel()
+    tries = _Tries.build(model, hand, state, normals[hand.body.indices])
     # Standard coordinates: the prior is N(0, I) in them.
     inverse = np.linalg.pinv(hand.spread, rcond=1e-3)
-    found = inverse @ (start - hand.mean)
-    local = normals[hand.body.indices]
+    found = inverse @ (tries.twists - hand.mean)
     cloud = np.concatenate([points, _DIRECTION_SCALE_M * directions], axis=1).astype(np.float32)
     rng = np.random.default_rng(0)
     center, width = np.zeros(len(found)), np.full(len(found), _SPREAD)
@@ -139,7 +146,7 @@ def _searched(
         tried = center + width * rng.standard_normal((count, len(found)))
         tried[0] = best
         twists = hand.mean + tried @ hand.spread.T
-        samples = _posed(model, hand, state, twists, local)
+        samples = tries.posed(_rotations(model, hand, state, twists), twists)
         cost = trimmed_costs(samples, cloud, _CUT_M, _CUT_M, _MODEL_SHARE)
         cost = cost + _PRIOR_M * np.sum(tried**2, axis=1)
         order = np.argsort(cost, kind="stable")
@@ -168,21 +175,60 @@ def _rotations(model: BodyModel, hand: Hand, state: BodyState, twists: Array) ->
     return found
 
 
-def _posed(
-    model: BodyModel, hand: Hand, state: BodyState, twists: Array, normals: Array
-) -> NDArray[np.float32]:
-    """(h, 6, n): the samples and their scaled normals for twists (h, 9)."""
-    body, parts = hand.body, list(hand.parts)
-    count, tries = len(body.indices), len(twists)
-    now = model.relative_twists(state.rotations)[parts].ravel()
-    still, change = body.arms(state, parts)
-    carried = still.ravel()[:, None] + change.reshape(still.size, -1) @ (twists - now).T
-    rotations = np.broadcast_to(state.rotations, (tries, *state.rotations.shape)).copy()
-    rotations[:, parts] = _rotations(model, hand, state, twists)
-    turning = np.swapaxes(rotations, 2, 3).reshape(tries, -1, 3).astype(np.float32)
-    arms = carried.T.astype(np.float32).reshape(tries, count, -1)
-    positions = arms @ turning + state.translation.astype(np.float32)
-    turns = rotations[:, hand.owner] @ np.swapaxes(state.rotations[hand.owner], 1, 2)
-    turned = np.einsum("hnij,nj->hni", turns, normals)
-    joined = np.concatenate([positions, _DIRECTION_SCALE_M * turned], axis=2)
-    return np.ascontiguousarray(joined.swapaxes(1, 2), np.float32)
+@dataclass(frozen=True, slots=True)
+class _Tries:
+    """The samples of one hand as functions of its parts' twists; the rest of the body is kept.
+
+    B_p of the parts that the search does not turn enters turned, summed up as one arm.
+    """
+
+    state: BodyState
+    twists: Array
+    """(9,): as the body has them now."""
+    still: Array
+    """(n, 4, 3): B_p of hand, thumb and fingers, then the others' sum."""
+    change: Array
+    """(n 4 3, 9): of it, with the twists."""
+    normals: Array
+    """(n, 3): in the parts' own frames."""
+    members: tuple[NDArray[np.intp], ...]
+    """The samples of each part."""
+
+    @classmethod
+    def build(cls, model: BodyModel, hand: Hand, state: BodyState, normals: Array) -> _Tries:
+        own = list(hand.parts)
+        others = np.delete(np.arange(model.part_count), own)
+        still, change = (found.astype(np.float64) for found in hand.body.arms(state, own))
+        turns = state.rotations[others]
+        rest = np.einsum("pij,npj->ni", turns, still[:, others])
+        rest_change = np.einsum("pij,npjck->nick", turns, change[:, others])
+        members = tuple(np.flatnonzero(hand.owner == part) for part in own)
+        local = np.empty_like(normals)
+        for part, mine in zip(own, members, strict=True):
+            local[mine] = normals[mine] @ state.rotations[part]
+        still = np.concatenate([still[:, own], rest[:, None]], axis=1)
+        change = np.concatenate([change[:, own], rest_change[:, None]], axis=1)
+        return cls(
+            state,
+            model.relative_twists(state.rotations)[own].ravel(),
+            still,
+            change.reshape(still.size, -1),
+            local,
+            members,
+        )
+
+    def posed(self, rotations: Array, twists: Array) -> NDArray[np.float32]:
+        """(h, 6, n): the samples and their scaled normals for rotations (h, 3, 3, 3) of the parts
+        and twists (h, 9)."""
+        count, tries = len(self.still), len(twists)
+        arms = (self.change @ (twists - self.twists).T).T.reshape(tries, count, 4, 3) + self.still
+        turning = np.concatenate(
+            [np.swapaxes(rotations, 2, 3), np.broadcast_to(np.eye(3), (tries, 1, 3, 3))], axis=1
+        )
+        out = np.empty((tries, 6, count), np.float32)
+        positions = arms.reshape(tries, count, 12) @ turning.reshape(tries, 12, 3)
+        out[:, :3] = np.swapaxes(positions + self.state.translation, 1, 2)
+        for index, mine in enumerate(self.members):
+            turned = rotations[:, index] @ self.normals[mine].T
+            out[:, 3:, mine] = _DIRECTION_SCALE_M * turned
+        return out

@@ -17,20 +17,36 @@ Array = NDArray[np.float64]
 _NEUTRAL_ARM_DEG = 43.0
 _ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+_SWINGS_DEG = (-25.0, 0.0, 25.0)
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
-_TRIM_M = 0.08
+_CLOUD_TRIM_M = 0.48
+"""Points of an arm that hangs at the wrong angle must tell: a hand is off by that much."""
+_BODY_TRIM_M = 0.08
+_STATURE_COMPONENTS = 40
+"""The first ones hold nearly all of it, and fewer are quicker to evaluate."""
+
+_Try = tuple[tuple[float, float], tuple[float, float], float]
+"""Degrees: of the arms from the trunk and of their swing back (left, right), of the heading."""
 
 
 def posed(
-    model: BodyModel, state: BodyState, arm_deg: tuple[float, float], heading_rad: float
+    model: BodyModel,
+    state: BodyState,
+    arm_deg: tuple[float, float],
+    swing_deg: tuple[float, float],
+    heading_rad: float,
 ) -> BodyState:
-    """A state with arms so many degrees from the trunk (left, right), turned about the vertical."""
+    """A state with arms (left, right) so many degrees from the trunk and so many behind it, turned
+    about the vertical."""
     names = list(model.part_names)
     twists = np.zeros((model.part_count, 3))
     twists[0, 2] = heading_rad
-    for side, sign, angle in (("left", 1.0, arm_deg[0]), ("right", -1.0, arm_deg[1])):
+    for side, sign, angle, swing in zip(
+        ("left", "right"), (1.0, -1.0), arm_deg, swing_deg, strict=True
+    ):
         lower = sign * np.radians(_NEUTRAL_ARM_DEG - angle)
         twists[names.index(f"shoulder_{side}"), 1] = 0.15 * lower
+        twists[names.index(f"upper_arm_{side}"), 0] = np.radians(swing)
         twists[names.index(f"upper_arm_{side}"), 1] = 0.85 * lower
         straighter = np.array([0.7, 0.1 * sign, 0.7 * sign]) * _STRAIGHTER_ELBOW_RAD
         twists[names.index(f"forearm_{side}")] = straighter
@@ -42,6 +58,7 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
     top = model.landmarks["crown"]
     sole = int(np.argmin(model.mean[:, 2]))
     gradient = (model.directions[:, top, 2] - model.directions[:, sole, 2]).astype(np.float64)
+    gradient[_STATURE_COMPONENTS:] = 0.0
     excess = stature_m - float(model.mean[top, 2] - model.mean[sole, 2])
     beta = gradient * excess / float(gradient @ gradient)
     norm = float(np.linalg.norm(beta))
@@ -51,7 +68,8 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
 def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list[BodyState]:
     """States to start from, best first, judged on a coarse sample of the cloud (n, 3).
 
-    First both arms at one angle and all headings, then each arm alone at the best heading.
+    First both arms at one angle and all headings, then each arm alone at the best heading, then
+    each arm swung forward and back.
     """
     stature = float(np.quantile(points[:, 2], 0.9995))
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
@@ -60,14 +78,22 @@ def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list
     # What bends the surface a little with the pose is left out here.
     arms, _ = scout.arms(state, ())
 
-    def scored(tried: list[tuple[tuple[float, float], float]]) -> tuple[Array, list[BodyState]]:
-        states = [posed(model, state, angles, np.radians(heading)) for angles, heading in tried]
+    def scored(tried: list[_Try]) -> tuple[Array, list[BodyState]]:
+        states = [posed(model, state, *one[:2], np.radians(one[2])) for one in tried]
         bodies, states = _placed(model, scout, arms, states, center)
         return _costs(bodies, points), states
 
-    together = [((arm, arm), heading) for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)]
-    _, heading = together[int(np.argmin(scored(together)[0]))]
-    costs, states = scored([(arms_deg, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)])
+    straight = (0.0, 0.0)
+    together = [
+        ((arm, arm), straight, heading) for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)
+    ]
+    heading = together[int(np.argmin(scored(together)[0]))][2]
+    apart = [(arms_deg, straight, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)]
+    costs, states = scored(apart)
+    arms_deg = apart[int(np.argmin(costs))][0]
+    swung = [(arms_deg, swing, heading) for swing in product(_SWINGS_DEG, _SWINGS_DEG)]
+    more_costs, more_states = scored([one for one in swung if any(one[1])])
+    costs, states = np.concatenate([costs, more_costs]), states + more_states
     return [states[index] for index in np.argsort(costs, kind="stable")]
 
 
@@ -95,8 +121,8 @@ def _costs(bodies: Array, points: Array) -> Array:
     found = trimmed_costs(
         np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
         points.astype(np.float32),
-        2 * _TRIM_M,
-        _TRIM_M,
+        _CLOUD_TRIM_M,
+        _BODY_TRIM_M,
         1.0,
     )
     return np.asarray(found)

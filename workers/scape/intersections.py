@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from workers.scape.crossings import crossing_pairs
-from workers.scape.deformation import Faces, vertex_normals
+from workers.scape.deformation import Faces, area_vectors, vertex_normals
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
@@ -26,6 +26,8 @@ _MOST_ROUNDS = 45
 _STUBBORN_ROUNDS = 3
 """Rounds after which a place no longer counts on the model's own shape."""
 _ROUNDS_A_RING = 4
+_HOPELESS = 120
+"""Triangles of one place that still cross by then: no flattening parts them."""
 _SWEEPS = 8
 _FLATTENING = 0.75
 """Share of the way to the neighbours' mean that a stubborn vertex goes in one round."""
@@ -39,12 +41,11 @@ def self_intersections(vertices: Array, faces: Faces) -> int:
 def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
     """(K,): triangles that look away from where they look on a reference surface (P, 3), and from
     where their surroundings look."""
-    here = _area_vectors(vertices, faces)
-    around = vertex_normals(vertices, faces)[faces].sum(axis=1)
-    there = _area_vectors(reference, faces)
-    return np.asarray(
-        (np.einsum("ki,ki->k", here, there) <= 0.0) & (np.einsum("ki,ki->k", here, around) <= 0.0)
-    )
+    here, there = area_vectors(vertices, faces), area_vectors(reference, faces)
+    turned = np.einsum("ki,ki->k", here, there) <= 0.0
+    around = vertex_normals(vertices, faces)[faces[turned]].sum(axis=1)
+    turned[turned] = np.einsum("ki,ki->k", here[turned], around) <= 0.0
+    return np.asarray(turned)
 
 
 def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
@@ -62,13 +63,15 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     current = gentle = vertices
     trouble = np.zeros(len(vertices), np.int64)
     asking: Mask = np.ones(len(faces), bool)
+    given_up: Mask = np.zeros(len(faces), bool)
     for round_ in range(_MOST_ROUNDS):
-        bad = turned_over(current, reference, faces)
-        bad[crossing_pairs(current, faces, asking).ravel()] = True
-        if not bad.any():
-            return current
+        bad = _bad(current, reference, faces, asking) & ~given_up
         if round_ == _STUBBORN_ROUNDS:
             gentle = current
+            given_up = bad & _in_large_places(faces, bad, mean)
+            bad &= ~given_up
+        if not bad.any():
+            break
         corners = np.zeros(len(vertices), bool)
         corners[faces[bad]] = True
         marked = _grown(corners, mean, 1)
@@ -78,9 +81,29 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
         moved = np.zeros(len(vertices), bool)
         moved[patch] = True
         asking = np.asarray(moved[faces].any(axis=1))
-    hopeless = turned_over(current, reference, faces)
-    hopeless[crossing_pairs(current, faces, asking).ravel()] = True
-    return _restored(current, gentle, np.unique(faces[hopeless]), mean)
+    else:
+        bad = _bad(current, reference, faces, asking)
+    return _restored(current, gentle, np.unique(faces[bad | given_up]), mean)
+
+
+def _bad(vertices: Array, reference: Array, faces: Faces, asking: Mask) -> Mask:
+    """(K,): triangles that are turned over, or cross another where one of the two asks."""
+    bad = turned_over(vertices, reference, faces)
+    bad[crossing_pairs(vertices, faces, asking).ravel()] = True
+    return bad
+
+
+def _in_large_places(faces: Faces, bad: Mask, mean: sp.csr_matrix) -> Mask:
+    """(K,): triangles of places where many bad ones hang together."""
+    corners = np.zeros(mean.shape[0], bool)
+    corners[faces[bad]] = True
+    around = np.flatnonzero(_grown(corners, mean, 1))
+    _, place = connected_components(mean[around][:, around], directed=False)
+    of_vertex = np.full(len(corners), -1)
+    of_vertex[around] = place
+    of_face = of_vertex[faces[:, 0]]
+    large = np.bincount(of_face[bad], minlength=place.max(initial=0) + 1) > _HOPELESS
+    return np.asarray((of_face >= 0) & large[of_face])
 
 
 def _restored(
@@ -123,8 +146,3 @@ def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
     linked = linked.tocsr()
     linked.eliminate_zeros()
     return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()
-
-
-def _area_vectors(vertices: Array, faces: Faces) -> Array:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))

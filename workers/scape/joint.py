@@ -8,6 +8,7 @@ share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,24 +19,27 @@ from scipy.spatial import cKDTree
 from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
 from workers.scape.cameras import CameraCorrections
-from workers.scape.correspondence import OrientedTree
+from workers.scape.correspondence import Followers, OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.free_space import FreeSpace
 from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
-from workers.scape.rows import CameraTerms, Rows, floor_rows, outline_rows
+from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
 from workers.scape.sampled import SampledBody, twist_chain
 from workers.scape.spread import farthest_first
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 
 _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
-_COARSE, _FINE = 600, 2000
+_COARSE, _SCOUTS, _FINE = 600, 1200, 2000
 _PULLED_POINTS = 10_000
+_COARSELY_PULLED = 4
+"""While the fit is coarse, every so many of them."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -54,6 +58,16 @@ class Stage:
     """What one row counts: neighbours share what the model cannot express. Low at first, so that
     the prior carries the face and the hands as they are to where they belong."""
 
+    @property
+    def coarse(self) -> bool:
+        """Whether samples stand for the whole skin."""
+        return self.samples == _COARSE
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Of the correspondences."""
+        return {"max_distance_m": self.gate_m, "max_angle_rad": self.angle_rad}
+
 
 COARSE = (
     *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
@@ -69,25 +83,57 @@ class Sampling:
     """Nested sample vertices with the model's derivatives, and who stands for whom."""
 
     body: SampledBody
-    coarse_of_vertex: NDArray[np.intp]
-    fine_of_vertex: NDArray[np.intp]
+    scouts: SampledBody
+    """The first ones: all the skin that the coarse stages look at."""
+    normals: Array
+    """(m, 3): of the scouts, on the mean body."""
+    share: Array
+    """(m,): the area that each scout stands for, in those of an average vertex."""
+    coarse_of_scout: NDArray[np.intp]
+    sample_of_vertex: NDArray[np.intp]
     hands: tuple[Hand, ...]
 
     @classmethod
     def build(cls, model: BodyModel) -> Sampling:
         """Samples spread evenly; the first ones alone are spread evenly too."""
         order = _spread(model)
+        places = model.mean[order]
+        scouts = places[:_SCOUTS]
+        scout_of_vertex = cKDTree(scouts).query(model.mean)[1]
+        body = model.at(order)
         return cls(
-            model.at(order),
-            cKDTree(model.mean[order[:_COARSE]]).query(model.mean)[1],
-            cKDTree(model.mean[order]).query(model.mean)[1],
+            body,
+            body.first(_SCOUTS),
+            vertex_normals(model.mean, model.faces)[order[:_SCOUTS]],
+            np.bincount(scout_of_vertex, model.vertex_shares, _SCOUTS).astype(np.float64),
+            cKDTree(places[:_COARSE]).query(scouts)[1],
+            cKDTree(places).query(model.mean)[1],
             hands_of(model),
         )
 
-    def stage(self, count: int) -> tuple[SampledBody, NDArray[np.intp]]:
-        if count == _FINE:
-            return self.body, self.fine_of_vertex
-        return self.body.first(count), self.coarse_of_vertex
+    def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
+        """The scouts, their normals turned with the parts."""
+        index = self.scouts.indices
+        turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
+        normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
+        return Skin(
+            self.scouts.evaluate(state),
+            normals / np.linalg.norm(normals, axis=1, keepdims=True),
+            model.part_of_vertex[index],
+            self.share,
+            self.coarse_of_scout,
+        )
+
+    def skin(self, model: BodyModel, state: BodyState) -> Skin:
+        """Every vertex."""
+        vertices = model.vertices(state)
+        return Skin(
+            vertices,
+            vertex_normals(vertices, model.faces),
+            model.part_of_vertex,
+            model.vertex_shares,
+            self.sample_of_vertex,
+        )
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
@@ -106,6 +152,8 @@ class Target:
     sigma_m: Array
     pulled: NDArray[np.intp]
     """Points that look for their vertex; a fixed, even subset."""
+    coarse: OrientedTree
+    """Of these alone."""
     free_space: FreeSpace
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
@@ -114,11 +162,13 @@ class Target:
     def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
         """An even subset of a cloud's points."""
         used = even_subset(len(cloud), most_points)
-        tree = OrientedTree.build(cloud.points[used], cloud.normals[used])
+        points, normals = cloud.points[used], cloud.normals[used]
+        pulled = even_subset(len(used), _PULLED_POINTS)
         return cls(
-            tree,
+            OrientedTree.build(points, normals),
             cloud.sigma_m[used],
-            even_subset(len(used), _PULLED_POINTS),
+            pulled,
+            OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
             cloud.camera[used].astype(np.intp),
         )
@@ -152,17 +202,25 @@ def fit_jointly(
 ) -> JointResult:
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
+    pulled = target.pulled
+    followers = Followers(model.faces, target.tree.points[pulled], target.tree.normals[pulled])
     terms: _DataTerms | None = None
-    for step, stage in enumerate(schedule):
-        body, sample_of_vertex = sampling.stage(stage.samples)
-        vertices = model.vertices(state)
-        terms = _data_terms(
-            model, target, cameras, vertices, stage, sample_of_vertex, len(body.indices), observer
-        )
-        state, cameras = _step(model, body, state, cameras, stage, terms, prior)
-        progress((step + 1) / len(schedule))
+    with ThreadPoolExecutor(max_workers=1) as beside:
+        for step, stage in enumerate(schedule):
+            skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
+            # What the correspondences need not wait for is done beside them.
+            probed = beside.submit(_probed, target, skin, stage)
+            derivative = beside.submit(
+                sampling.body.first(stage.samples).jacobian, state, stage.components
+            )
+            terms = _data_terms(model, target, followers, probed, cameras, skin, stage)
+            if observer is not unobserved:
+                drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
+                observer("correspondences", {"vertices": model.vertices(state), **drawn})
+            state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
+            progress((step + 1) / len(schedule))
     assert terms is not None
-    return JointResult(state, cameras, model.vertices(state), terms.correspondences, len(schedule))
+    return JointResult(state, cameras, model.vertices(state), len(terms.on_body), len(schedule))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,49 +231,60 @@ class _DataTerms:
     """(n, 3)."""
     cameras: CameraTerms | None
     """None while the corrections are kept."""
-    correspondences: int
+    on_body: Array
+    """(m, 3): one end of each correspondence."""
+    on_cloud: Array
+    """(m, 3): the other."""
+
+
+def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Even places of the skin that have a point, and which."""
+    cloud = target.coarse if stage.coarse else target.tree
+    probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
+    probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **stage.limits)
+    return probes[probing], target.pulled[found] if stage.coarse else found
 
 
 def _data_terms(
     model: BodyModel,
     target: Target,
+    followers: Followers,
+    probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
     cameras: CameraCorrections,
-    vertices: Array,
+    skin: Skin,
     stage: Stage,
-    sample_of_vertex: NDArray[np.intp],
-    samples: int,
-    observer: Observer,
 ) -> _DataTerms:
     """Correspondences, floor and outlines, summed up at the samples."""
-    normals = vertex_normals(vertices, model.faces)
     cloud = target.tree
-    pulled = target.pulled[:: 2 if stage.samples == _COARSE else 1]
-    limits = {"max_distance_m": stage.gate_m, "max_angle_rad": stage.angle_rad}
-    body = OrientedTree.build(vertices, normals)
-    asking, mine = body.pairs(cloud.points[pulled], cloud.normals[pulled], **limits)
-    probes = np.arange(0, len(vertices), max(1, len(vertices) // (2 * stage.samples)))
-    probing, found = cloud.pairs(vertices[probes], normals[probes], **limits)
-    vertex = np.concatenate([mine, probes[probing]])
+    if stage.coarse:
+        pulled = target.pulled[::_COARSELY_PULLED]
+        asking, mine = OrientedTree.build(skin.positions, skin.normals).pairs(
+            cloud.points[pulled], cloud.normals[pulled], **stage.limits
+        )
+    else:
+        pulled = target.pulled
+        asking, mine = followers.pairs(skin.positions, skin.normals, **stage.limits)
+    probes, found = probed.result()
+    place = np.concatenate([mine, probes])
     point = np.concatenate([pulled[asking], found])
-    on_body, camera = vertices[vertex], target.camera[point]
+    on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
-    observer("correspondences", {"vertices": vertices, "on_body": on_body, "on_cloud": on_cloud})
-    direction = normals[vertex]
+    direction = skin.normals[place]
     residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    pairs = Rows(vertex, direction, residual, stage.row_share * robust / variance)
-    rows = [pairs, floor_rows(model, vertices, normals, max(0.012, 0.5 * stage.gate_m))]
+    pairs = Rows(place, direction, residual, stage.row_share * robust / variance)
+    rows = [pairs, floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))]
     camera_terms = None
-    if stage.samples != _COARSE:
-        rows.append(outline_rows(model, target.free_space, vertices, stage.row_share))
+    if not stage.coarse:
+        rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(
-                pairs, derivative, camera, len(cameras), sample_of_vertex, samples
+                pairs, derivative, camera, len(cameras), skin, stage.samples
             )
-    weight, pull = Rows.joined(*rows).at_samples(sample_of_vertex, samples)
-    return _DataTerms(weight, pull, camera_terms, len(vertex))
+    weight, pull = Rows.joined(*rows).at_samples(skin, stage.samples)
+    return _DataTerms(weight, pull, camera_terms, on_body, on_cloud)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,23 +309,24 @@ class _TwistPrior:
 
 def _step(
     model: BodyModel,
-    body: SampledBody,
     state: BodyState,
     cameras: CameraCorrections,
-    stage: Stage,
+    derivative: Array32,
     terms: _DataTerms,
     prior: _TwistPrior,
 ) -> tuple[BodyState, CameraCorrections]:
-    """One Gauss-Newton step."""
+    """One Gauss-Newton step; derivative is that of the samples, (n, 3, D)."""
     parts = model.part_count
-    active = min(stage.components, model.beta_count)
-    _, derivative = body.jacobian(state, active)
     size = derivative.shape[2]
+    active = size - 3 * parts - 3
     rows = derivative.reshape(-1, size)
     extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
-    weighted = terms.weight.astype(np.float32) @ derivative
-    normal[:size, :size] = rows.T @ weighted.reshape(-1, size)
+    # Half of the weights goes to either side: numpy then computes one triangle of the product.
+    slack = 1e-9 * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + 1e-12
+    half = np.linalg.cholesky(terms.weight + slack * np.eye(3)).astype(np.float32)
+    weighted = (half.transpose(0, 2, 1) @ derivative).reshape(-1, size)
+    normal[:size, :size] = weighted.T @ weighted
     gradient[:size] = terms.pull.ravel().astype(np.float32) @ rows
     shape = slice(3 * parts, 3 * parts + active)
     normal[shape, shape] += np.eye(active)

@@ -171,32 +171,26 @@ class BodyModel:
     def turned(self, surface: Array, rotations: Array, translation: Array) -> Array:
         """A neutral surface (P, 3) with its parts turned and its pelvis put in place."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        turned_edges = edges(surface, self.faces) @ np.swapaxes(blended, 1, 2)
-        found = self.solver.vertices(turned_edges)
+        found = self.solver.carried(surface, blended)
         return np.asarray(found - self.anchor @ found + translation)
 
     def unturned(self, vertices: Array, rotations: Array) -> Array:
         """The neutral surface (P, 3) of a posed one: the inverse of `turned`, its pelvis at the
         mean body's."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        back = edges(vertices, self.faces) @ _inverse_transposed(blended)
-        found = self.solver.vertices(back)
+        found = self.solver.carried(vertices, _inverse(blended))
         return np.asarray(found + self.anchor @ (self.mean - found))
 
     def repose(self, vertices: Array, state: BodyState, new_state: BodyState) -> Array:
         """A free-form surface (P, 3) that was fitted at `state`, carried to another pose.
 
-        What the surface has beyond the model stays with it; the pose-dependent deformation
-        changes with the pose.
+        The body is the model's in the new pose; what the surface has beyond the model turns with
+        the parts that it lies on.
         """
-        surface = self.unturned(vertices, state.rotations)
-        twists = self.relative_twists(new_state.rotations) - self.relative_twists(state.rotations)
-        change = np.tensordot(twists[1:].ravel().astype(np.float32), self.pose_fields, 1)
-        found = self.turned(surface + change, new_state.rotations, new_state.translation)
-        # Blended rotations cannot be undone exactly; what is left over turns with its part.
-        left = vertices - self.turned(surface, state.rotations, self.anchor @ vertices)
+        beyond = vertices - self.vertices(state)
         turns = new_state.rotations @ np.swapaxes(state.rotations, 1, 2)
-        return np.asarray(found + np.einsum("pij,pj->pi", turns[self.part_of_vertex], left))
+        blended = (self.vertex_weights @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
+        return self.vertices(new_state) + np.einsum("vij,vj->vi", blended, beyond)
 
     def part_rotations(self, surface: Array, vertices: Array) -> Array:
         """(L, 3, 3): the rotations that take the parts of a neutral surface to a posed one."""
@@ -235,11 +229,11 @@ class BodyModel:
         return SampledBody.build(self, indices)
 
 
-def _inverse_transposed(matrices: Array) -> Array:
+def _inverse(matrices: Array) -> Array:
     """Of 3x3 matrices (K, 3, 3), by their cofactors: much quicker than a general inverse."""
     a, b, c = (matrices[:, i] for i in range(3))
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    return np.asarray(cofactors / np.einsum("ki,ki->k", a, cofactors[:, 0])[:, None, None])
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+    return np.asarray(cofactors / np.einsum("ki,ki->k", a, cofactors[:, :, 0])[:, None, None])
 
 
 def save_model(path: Path, fields: dict[str, Any], metadata: dict[str, Any]) -> None:

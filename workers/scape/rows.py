@@ -17,34 +17,53 @@ _FLOOR_SHARE = 0.02
 _SOLE_BAND_M = 0.003
 _FACING_DOWN = -0.8
 _OUTLINE_SIGMA_M = 0.004
+_OUTLINE_EVERY = 3
+"""Neighbours see the same pixels."""
 _SEARCHED = ("hand", "thumb", "fingers")
 """The search for the hands looks at points; one curl for four fingers cannot keep an outline."""
+
+
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """Places of the body that rows hold on to: all vertices, or some while the fit is coarse."""
+
+    positions: Array
+    """(k, 3)."""
+    normals: Array
+    """(k, 3)."""
+    part: NDArray[np.int32]
+    """(k,)."""
+    share: Array
+    """(k,): the area that each stands for, in those of an average vertex."""
+    sample: NDArray[np.intp]
+    """(k,): the sample whose derivative each one takes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
     """n distances that ought to vanish."""
 
-    vertex: NDArray[np.intp]
+    place: NDArray[np.intp]
+    """(n,): of the skin."""
     direction: Array
     """(n, 3), unit."""
     residual_m: Array
-    """(n,): how far the vertex should go along the direction."""
+    """(n,): how far the place should go along the direction."""
     weight: Array
     """(n,): one over the variance, times what the row counts."""
 
     @classmethod
     def joined(cls, *rows: Rows) -> Rows:
         return cls(
-            np.concatenate([one.vertex for one in rows]),
+            np.concatenate([one.place for one in rows]),
             np.concatenate([one.direction for one in rows]),
             np.concatenate([one.residual_m for one in rows]),
             np.concatenate([one.weight for one in rows]),
         )
 
-    def at_samples(self, sample_of_vertex: NDArray[np.intp], count: int) -> tuple[Array, Array]:
+    def at_samples(self, skin: Skin, count: int) -> tuple[Array, Array]:
         """Sums for the samples: 3x3 weights (count, 3, 3) and pulls (count, 3)."""
-        sample, direction = sample_of_vertex[self.vertex], self.direction
+        sample, direction = skin.sample[self.place], self.direction
         weight = np.empty((count, 3, 3))
         for i in range(3):
             weighted = self.weight * direction[:, i]
@@ -69,13 +88,18 @@ class CameraTerms:
 
     @classmethod
     def build(
-        cls, rows: Rows, derivative: Array, camera: NDArray[np.integer], cameras: int,
-        sample_of_vertex: NDArray[np.intp], count: int,
-    ) -> CameraTerms:  # fmt: skip
+        cls,
+        rows: Rows,
+        derivative: Array,
+        camera: NDArray[np.integer],
+        cameras: int,
+        skin: Skin,
+        count: int,
+    ) -> CameraTerms:
         """Of rows whose points, of cameras (n,), move by derivative (n, 6)."""
         normal = np.zeros((6 * cameras, 6 * cameras))
         gradient = np.zeros(6 * cameras)
-        cell = sample_of_vertex[rows.vertex] * cameras + camera
+        cell = skin.sample[rows.place] * cameras + camera
         cross = np.empty((count * cameras, 3, 6))
         for j in range(6):
             weighted = rows.weight * derivative[:, j]
@@ -91,38 +115,37 @@ class CameraTerms:
         return cls(normal, gradient, side_by_side.reshape(count, 3, 6 * cameras))
 
 
-def floor_rows(model: BodyModel, vertices: Array, normals: Array, reach_m: float) -> Rows:
+def floor_rows(model: BodyModel, skin: Skin, reach_m: float) -> Rows:
     """Each foot's lowest millimetres stand on z = 0, which no camera sees; the arch does not.
 
     A foot that is farther from the floor than reach_m is left alone; nothing lies below the floor.
     """
-    height = vertices[:, 2]
+    height = skin.positions[:, 2]
     touching = height < 0.0
     for side in ("left", "right"):
-        foot = model.part_of_vertex == model.part_names.index(f"foot_{side}")
+        foot = skin.part == model.part_names.index(f"foot_{side}")
         low = float(height[foot].min())
         if abs(low) < reach_m:
-            touching |= foot & (height < low + _SOLE_BAND_M) & (normals[:, 2] < _FACING_DOWN)
+            touching |= foot & (height < low + _SOLE_BAND_M) & (skin.normals[:, 2] < _FACING_DOWN)
     found = np.flatnonzero(touching)
     return Rows(
         found,
         np.tile((0.0, 0.0, 1.0), (len(found), 1)),
         -height[found],
-        _FLOOR_SHARE / _FLOOR_SIGMA_M**2 * model.vertex_shares[found],
+        _FLOOR_SHARE / _FLOOR_SIGMA_M**2 * skin.share[found],
     )
 
 
-def outline_rows(
-    model: BodyModel, free_space: FreeSpace, vertices: Array, row_share: float
-) -> Rows:
-    """Vertices go back from where a camera saw the booth behind them."""
-    found = free_space.intrusions(vertices)
+def outline_rows(model: BodyModel, free_space: FreeSpace, skin: Skin, row_share: float) -> Rows:
+    """Places go back from where a camera saw the booth behind them."""
+    found = free_space.intrusions(skin.positions[::_OUTLINE_EVERY])
+    place = _OUTLINE_EVERY * found.vertex
     searched = [i for i, name in enumerate(model.part_names) if name.startswith(_SEARCHED)]
-    kept = ~np.isin(model.part_of_vertex[found.vertex], searched)
-    vertex = found.vertex[kept]
+    kept = ~np.isin(skin.part[place], searched)
+    place = place[kept]
     return Rows(
-        vertex,
+        place,
         found.direction[kept],
         -found.depth_m[kept],
-        row_share / _OUTLINE_SIGMA_M**2 * model.vertex_shares[vertex],
+        _OUTLINE_EVERY * row_share / _OUTLINE_SIGMA_M**2 * skin.share[place],
     )

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workers.scape.cache import cached_arrays
-from workers.scape.kernels import add_blocks
+from workers.scape.kernels import add_blocks, add_places
 
 if TYPE_CHECKING:
     from workers.scape.model import BodyModel, BodyState
@@ -86,7 +86,25 @@ class SampledBody:
 
     def evaluate(self, state: BodyState) -> Array:
         """Positions (n, 3) in metres."""
-        return self.jacobian(state, 0)[0]
+        twists = self._twists(state)
+        coefficients = np.concatenate([[1.0], state.beta, twists[1:].ravel()])
+        arms = np.einsum("pij,gpj->gi", state.rotations, self.shared @ coefficients)
+        positions = (arms + state.translation)[self.groups]
+        add_places(
+            self.starts,
+            self.parts,
+            self.mean,
+            self.shape,
+            self.twist_starts,
+            self.twist_parts,
+            self.twist_joints,
+            self.twist_blocks,
+            state.rotations.astype(np.float32),
+            state.beta[: _used(state)].astype(np.float32),
+            twists.astype(np.float32),
+            positions,
+        )
+        return positions
 
     def jacobian(self, state: BodyState, shapes: int | None = None) -> tuple[Array, Array32]:
         """Positions (n, 3) and derivatives (n, 3, D), D = 3 L + shapes + 3.
@@ -98,9 +116,7 @@ class SampledBody:
         """
         model, rotations = self.model, state.rotations
         shapes = model.beta_count if shapes is None else min(shapes, model.beta_count)
-        twists = model.relative_twists(rotations)
-        twists[0] = 0.0
-        used = max(shapes, 1 + int(np.flatnonzero(state.beta).max(initial=-1)))
+        twists = self._twists(state)
         positions, derivative = self._of_groups(state, twists, shapes)
         positions, derivative = positions[self.groups], derivative[self.groups]
         add_blocks(
@@ -114,12 +130,18 @@ class SampledBody:
             self.twist_blocks,
             model.part_parents,
             rotations.astype(np.float32),
-            state.beta[:used].astype(np.float32),
+            state.beta[: max(shapes, _used(state))].astype(np.float32),
             twists.astype(np.float32),
             positions,
             derivative,
         )
         return positions, derivative
+
+    def _twists(self, state: BodyState) -> Array:
+        """(L, 3): relative; the root's changes nothing of a body's form."""
+        twists = self.model.relative_twists(state.rotations)
+        twists[0] = 0.0
+        return twists
 
     def arms(self, state: BodyState, joints: Sequence[int]) -> tuple[Array32, Array32]:
         """B_p(X) (n, L, 3), what each part turns, and its change (n, L, 3, J, 3) with the relative
@@ -164,6 +186,11 @@ class SampledBody:
         derivative[:, :, 3 * parts : -3] = fields[:, :, 1 : 1 + shapes]
         derivative[:, :, -3:] = np.eye(3, dtype=np.float32)
         return arms.sum(axis=1) + state.translation, derivative
+
+
+def _used(state: BodyState) -> int:
+    """Components up to the last that is not 0."""
+    return 1 + int(np.flatnonzero(state.beta).max(initial=-1))
 
 
 def _expanded(starts: Index) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -15,20 +15,20 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import cg
 
 from station.depth import PointCloud
-from workers.scape.correspondence import OrientedTree
-from workers.scape.deformation import vertex_normals
+from workers.scape.correspondence import Followers
+from workers.scape.deformation import area_vectors, vertex_normals
+from workers.scape.kernels import conjugate_gradients
 from workers.scape.model import BodyModel
 
 Array = NDArray[np.float64]
 
 _ROUNDS = (
-    # gate, angle, stiffness
-    (0.030, np.radians(50), 240.0),
-    (0.020, np.radians(45), 48.0),
-    (0.012, np.radians(40), 12.0),
+    # gate, angle, stiffness, tolerance of the solve
+    (0.030, np.radians(50), 240.0, 1e-2),
+    (0.020, np.radians(45), 48.0, 1e-2),
+    (0.012, np.radians(40), 12.0, 1e-3),
 )
 _SIGMA_OF_STIFFNESS_M = 0.001
 _FADE = 2.5e-5
@@ -38,7 +38,7 @@ _INDEPENDENT = 0.25
 _LEAST_SIGMA_M = 3e-4
 _SOLE_M = 0.03
 _LIFTED_M = 0.02
-_MOST_POINTS = 90_000
+_MOST_POINTS = 50_000
 """More add nothing beyond what neighbouring readings share."""
 
 
@@ -58,25 +58,26 @@ class SurfaceFit:
 def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
+    followers = Followers(model.faces, cloud.points[every], cloud.normals[every], dense=True)
+    noise = cloud.sigma_m[every]
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
     weight = np.zeros(len(vertices))
     residual = np.zeros(len(vertices))
-    for gate_m, angle_rad, stiffness in _ROUNDS:
+    for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
         normals = vertex_normals(current, model.faces)
-        residual, weight = _gathered(current, normals, points, directions, noise, gate_m, angle_rad)
+        residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
-        matrix = sp.diags(weight) + bending * (laplacian + _FADE * identity)
-        step, _ = cg(
-            matrix, weight * residual, rtol=1e-4, maxiter=250, M=sp.diags(1.0 / matrix.diagonal())
+        matrix = (sp.diags(weight) + bending * (laplacian + _FADE * identity)).tocsr()
+        step = conjugate_gradients(
+            matrix.indptr, matrix.indices, matrix.data, weight * residual, tolerance, 250
         )
         step *= _hold(model, current, normals, step)
         current = current + step[:, None] * normals
     current = _stood_on_floor(model, current)
     normals = vertex_normals(current, model.faces)
-    residual, weight = _gathered(current, normals, points, directions, noise, *_ROUNDS[-1][:2])
+    residual, weight = _gathered(current, normals, followers, noise, *_ROUNDS[-1][:2])
     # A vertex between others that have points is seen as well: the template is finer than pixels.
     seen = (abs(laplacian) @ weight) > 0
     return SurfaceFit(
@@ -97,8 +98,7 @@ def _membrane(model: BodyModel) -> sp.csr_matrix:
 def _gathered(
     vertices: Array,
     normals: Array,
-    points: Array,
-    directions: Array,
+    followers: Followers,
     sigma_m: Array,
     gate_m: float,
     angle_rad: float,
@@ -111,9 +111,10 @@ def _gathered(
     the polygon through them is short already; along the points' own normals it puts them as far
     outside as the polygon's girth needs to be that of the curve, to second order.
     """
-    used, vertex = OrientedTree.build(vertices, normals).pairs(
-        points, directions, max_distance_m=gate_m, max_angle_rad=angle_rad
+    used, vertex = followers.pairs(
+        vertices, normals, max_distance_m=gate_m, max_angle_rad=angle_rad
     )
+    points, directions = followers.points, followers.normals
     distance = np.einsum("ni,ni->n", directions[used], points[used] - vertices[vertex])
     information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
@@ -142,13 +143,10 @@ def _stood_on_floor(model: BodyModel, vertices: Array) -> Array:
 def _hold(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
     """1 where a step keeps every triangle's side, less where it would flip one."""
     faces = model.faces
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    before = np.cross(b - a, c - a)
+    before = area_vectors(vertices, faces)
     factor = np.ones(len(vertices))
     for _ in range(4):
-        moved = vertices + (factor * step)[:, None] * normals
-        a, b, c = (moved[faces[:, i]] for i in range(3))
-        after = np.cross(b - a, c - a)
+        after = area_vectors(vertices + (factor * step)[:, None] * normals, faces)
         flipped = np.einsum("ki,ki->k", before, after) <= 0.1 * np.einsum(
             "ki,ki->k", before, before
         )

@@ -57,7 +57,7 @@ def report_parts(
     """Reports by part, the point-to-surface rms in metres and the share of unexplained points."""
     areas = vertex_areas(vertices, model.faces)
     normals = vertex_normals(vertices, model.faces)
-    points, directions = _thinned(cloud, 20_000)
+    points, directions = _thinned(cloud, 10_000)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     offsets = points - vertices[vertex]
     away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
