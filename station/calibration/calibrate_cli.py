@@ -224,8 +224,8 @@ def _rest(booth: _Booth, step: str) -> None:
     _lay(booth, step, where)
 
 
-def _lay(booth: _Booth, step: str, where: str) -> None:
-    booth.guide.step(f"Ball {where}", f"Lay the ball {where} and step back.")
+def _lay(booth: _Booth, step: str, where: str, exactly: str = "") -> None:
+    booth.guide.step(f"Ball {where}", f"Lay the ball {where}{exactly}; then step back.")
     with booth.feed(step) as (feed, session):
         rest_ball(feed, session, booth.guide, step)
 
@@ -243,7 +243,8 @@ def _around(booth: _Booth, asked: bool) -> None:
         ):
             return
         where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
-        _lay(booth, step, f"on the floor {where}, 0.6 m away, where the lower cameras see it")
+        exactly = ", 0.6 m away, where a lower camera sees it"
+        _lay(booth, step, f"on the floor {where}", exactly)
 
 
 def _walls(booth: _Booth, asked: bool) -> None:

@@ -13,13 +13,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.pairwise import GATE_M, Pair, Track, match
+from station.calibration.pairwise import GATE_M, Pair, Track, match, relate
 from station.geometry import transform
 
 Array = NDArray[np.float64]
 
 _WINDOW_S = 4.0
-_LEAST_IN_WINDOW = 8
+_LEAST_IN_WINDOW_S = 0.8
 _LONGEST_SHIFT_S = 3.0
 _SHORTEST_SHIFT_S = 0.15
 """In that time the ball goes farther than depth errors reach: shorter jumps are told from them only
@@ -31,7 +31,9 @@ _AGREEING = 0.6
 _GAIN = 0.3
 """By how much more of a window's matches must agree once a clock is shifted."""
 _CUT_STEP_S = 2.0
-_LEAST_ON_A_SIDE = 25
+_LEAST_ON_A_SIDE_S = 2.5
+_COUNTED_S = 0.1
+"""Detections count once in so long: how long a camera errs does not depend on its rate."""
 _SPEED_SPAN_S = 0.05
 _NOISE_M = 0.003
 """Between two corrected detections of one ball."""
@@ -89,22 +91,44 @@ def small_jump(tracks: Mapping[str, Track]) -> ClockJump | None:
     return worst
 
 
-def moved_camera(pairs: Mapping[tuple[str, str], Pair]) -> str | None:
-    """A camera that agrees with the others before or after a moment, but not both."""
+def moved_camera(tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pair]) -> str | None:
+    """A camera that agrees with the others before or after a moment, but not both.
+
+    Then it agrees with them in another way: one that took a head for the ball does not.
+    """
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
     every = np.concatenate([pair.times_s for pair in pairs.values()])
     worst, largest = None, _MOVED_DROP
     for cut_s in np.arange(every.min(), every.max(), _CUT_STEP_S):
         for name in names:
-            drops = []
+            drops: dict[tuple[str, str], float] = {}
             for key, pair in pairs.items():
                 early = pair.times_s < cut_s
-                enough = min(early.sum(), (~early).sum()) >= _LEAST_ON_A_SIDE
-                if name in key and enough:
-                    drops.append(abs(pair.agree[early].mean() - pair.agree[~early].mean()))
-            if len(drops) >= 2 and np.median(drops) > largest:
-                worst, largest = name, float(np.median(drops))
+                sides = (_seen_s(pair.times_s[side]) for side in (early, ~early))
+                if name in key and min(sides) >= _LEAST_ON_A_SIDE_S:
+                    drops[key] = float(pair.agree[early].mean() - pair.agree[~early].mean())
+            drop = float(np.median(np.abs(list(drops.values())))) if len(drops) >= 2 else 0.0
+            if drop > largest and _stands_elsewhere(tracks, drops, cut_s):
+                worst, largest = name, drop
     return worst
+
+
+def _stands_elsewhere(
+    tracks: Mapping[str, Track], drops: Mapping[tuple[str, str], float], cut_s: float
+) -> bool:
+    """Whether pairs agree by themselves on the side of the cut on which they agree less."""
+    shares = []
+    for (a, b), drop in drops.items():
+        late = tracks[a].times_s >= cut_s
+        side = late if drop > 0.0 else ~late
+        pair = relate(Track(tracks[a].times_s[side], tracks[a].points[side]), tracks[b])
+        shares.append(0.0 if pair is None else float(pair.agree.mean()))
+    return float(np.median(shares)) > _AGREEING
+
+
+def _seen_s(times_s: Array) -> float:
+    """For how long something was seen, gaps left out."""
+    return _COUNTED_S * len(np.unique(np.floor(times_s / _COUNTED_S)))
 
 
 def _window_shifts(a: Track, b: Track, pair: Pair) -> list[float]:
@@ -115,8 +139,9 @@ def _window_shifts(a: Track, b: Track, pair: Pair) -> list[float]:
     for start in np.arange(pair.times_s.min(), pair.times_s.max(), _WINDOW_S):
         inside = (pair.times_s >= start) & (pair.times_s < start + _WINDOW_S)
         window = (a.times_s >= start) & (a.times_s < start + _WINDOW_S)
-        before = float(pair.agree[inside].mean()) if inside.sum() >= _LEAST_IN_WINDOW else 0.0
-        if window.sum() < _LEAST_IN_WINDOW or before > _AGREEING:
+        known = _seen_s(pair.times_s[inside]) >= _LEAST_IN_WINDOW_S
+        before = float(pair.agree[inside].mean()) if known else 0.0
+        if _seen_s(a.times_s[window]) < _LEAST_IN_WINDOW_S or before > _AGREEING:
             continue
         shares = [_agreement(a, b, pair.a_from_b, window, float(shift)) for shift in shifts]
         best = int(np.argmax(shares))
@@ -129,7 +154,7 @@ def _agreement(
     a: Track, b: Track, a_from_b: Array, window: NDArray[np.bool_], shift: float
 ) -> float:
     places, known = b.at(a.times_s[window] + shift)
-    if known.sum() < _LEAST_IN_WINDOW:
+    if _seen_s(a.times_s[window][known]) < _LEAST_IN_WINDOW_S:
         return 0.0
     away = np.linalg.norm(a.points[window] - transform(a_from_b, places), axis=1)
     return float(np.mean(away[known] < GATE_M))
@@ -156,7 +181,7 @@ def _step(measured: tuple[Array, Array, Array], cut_s: float) -> tuple[float, fl
     """How much later after the cut than before, and its standard deviation."""
     times, pulled, known = measured
     early = times < cut_s
-    if min(early.sum(), (~early).sum()) < _LEAST_ON_A_SIDE:
+    if min(_seen_s(times[side]) for side in (early, ~early)) < _LEAST_ON_A_SIDE_S:
         return None
     lateness = [pulled[side].sum() / known[side].sum() for side in (early, ~early)]
     variance = sum(_NOISE_M**2 / known[side].sum() for side in (early, ~early))

@@ -43,6 +43,8 @@ _TAIL = 4.0
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
+_LEAST_TYPICAL = 0.2
+"""Of the noise's variance."""
 _MEDIAN = 2.366
 """Of the squared deviation of three numbers."""
 
@@ -296,8 +298,10 @@ def _robust_weight(deviation: Array) -> Array:
     """Weights (n,) that leave out what deviates far more than most do.
 
     As long as depth errors are not yet corrected all deviate, and none may be left out for that.
+    Once they are most deviate by less than the noise that is assumed: fingers over the ball then
+    show, although they deviate by no more than that noise could.
     """
-    typical = max(float(np.median(deviation)) / _MEDIAN, 1.0)
+    typical = max(float(np.median(deviation)) / _MEDIAN, _LEAST_TYPICAL)
     deviation = deviation / typical
     far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
     return np.where(deviation < _REJECT, far, 0.0)

@@ -47,11 +47,11 @@ _LARGEST_SCATTER = 3.0
 _MARK_TOLERANCE_M = 0.008
 _LEAST_SPREAD_M = 0.15
 """Of the places where the ball rested, from one line, where no camera sees the floor."""
-_LARGEST_SLOPE_RAD = np.radians(0.1)
-"""A body's head is 3 mm to one side at that."""
+_GOOD_SLOPE_RAD, _LARGEST_SLOPE_RAD = np.radians(0.06), np.radians(0.1)
+"""A body's head is 3 mm to one side at the latter."""
 _AROUND_WORDS = (
-    "lay it to the left, to the right and behind the mark, half a metre away, where the lower "
-    "cameras see it (station calibrate around)"
+    "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
+    "sees it (station calibrate around)"
 )
 
 
@@ -83,6 +83,8 @@ class Solution:
             )
             off_mm = 1e3 * float(np.linalg.norm(one.mean_m))
             lines.append(f"{name}: {known}; off by {off_mm:.1f} mm in {one.detections} tests")
+        slope_deg = np.degrees(self.placed.slope_sigma_rad)
+        lines.append(f"the floor's slope is known to {slope_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
 
     @property
@@ -92,6 +94,7 @@ class Solution:
         return {
             "residual_rms_m": self.rig.residual_rms_m,
             "measured_radius_m": self.radius_m,
+            "slope_sigma_rad": self.placed.slope_sigma_rad,
             "weak": list(self.weak),
             "cameras": {
                 name: {
@@ -171,8 +174,10 @@ def solve(
     _check_slope(placed)
     _check_mark(placed, radius_m)
     rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
-    weak = () if covered.enough else (covered.advice(),)
-    return Solution(rig, placed, found, weak, state.clock_s, measured_m)
+    weak = [] if covered.enough else [covered.advice()]
+    if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
+        weak.append(f"for the floor's slope, {_AROUND_WORDS}")
+    return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)
 
 
 def _problem(
@@ -277,8 +282,9 @@ def _check_pairs(
         raise CalibrationError(
             "no two cameras saw the ball at one time: wave it where several of them see it"
         )
-    _check_clocks(clocks.large_jump({name: own.track for name, own in detections.items()}, pairs))
-    moved = clocks.moved_camera(pairs)
+    tracks = {name: own.track for name, own in detections.items()}
+    _check_clocks(clocks.large_jump(tracks, pairs))
+    moved = clocks.moved_camera(tracks, pairs)
     if moved is not None:
         raise CalibrationError(
             f"camera {moved} was moved while the ball was waved: fix it, and wave the ball again"
@@ -362,8 +368,8 @@ def _check_sigma(placed: Placed, reference: str, covered: Coverage) -> None:
 def _check_slope(placed: Placed) -> None:
     if placed.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         raise CalibrationError(
-            f"the floor's slope is known to {np.degrees(placed.slope_sigma_rad):.2f} degrees only; "
-            f"with the ball, {_AROUND_WORDS}"
+            f"the floor's slope is known to {np.degrees(placed.slope_sigma_rad):.2f} degrees only: "
+            f"{_AROUND_WORDS}"
         )
 
 

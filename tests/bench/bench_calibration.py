@@ -41,8 +41,8 @@ from station.geometry import invert
 Array = NDArray[np.float64]
 
 _BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
-_STRIDE = 2
-"""Fifteen frames a second of thirty: finding the ball in those of four cameras takes one core."""
+_STRIDE = 3
+"""Ten frames a second."""
 _CYLINDER_M = (0.15, 1.7)
 _REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
 from station.calibration.drift import (
     LEVER_M,
@@ -92,10 +93,19 @@ def _false_alarms(sensors: dict[str, _Sensor], scans: int) -> None:
         chi = np.mean([move.xi @ np.linalg.solve(move.covariance, move.xi) for move in moves]) / 6
         nearest = max(move.alarm() for move in moves)
         print(f"  {name:<14}{named.sum():>8}{nearest:>10.2f}{1e3 * size:>9.2f}{chi:>10.2f}")
-    rate = alarms.mean()
+    count = int(alarms.sum())
+    # Clopper and Pearson 1934, one-sided.
+    bound = float(beta.ppf(0.95, count + 1, scans - count)) if count < scans else 1.0
+    enough = int(np.ceil(np.log(0.05) / np.log1p(-FALSE_ALARMS_BAR)))
+    if bound < FALSE_ALARMS_BAR:
+        verdict = "met"
+    elif scans < enough:
+        verdict = f"not shown: that takes {enough} scans without an alarm"
+    else:
+        verdict = "missed"
     print(
-        f"  scans refused for nothing: {alarms.sum()} of {scans}, {rate:.4f}   (bar: < 0.001; "
-        f"{'met' if rate < FALSE_ALARMS_BAR else 'missed'}; nearest: share of what alarms)"
+        f"  scans refused for nothing: {count} of {scans}, at 95 % confidence below {bound:.5f}   "
+        f"(bar: < {FALSE_ALARMS_BAR:g}; {verdict}; nearest: share of what alarms)"
     )
 
 
