@@ -28,9 +28,10 @@ MOVED_RAD = float(np.radians(0.3))
 """A camera that moved by either has to be named."""
 LEVER_M = MOVED_M / MOVED_RAD
 """Turns rotations into metres, so that both limits are one length."""
-_CERTAINTY = 4.2
-"""Standard deviations beyond which a direction alarms: with four cameras, of which each sees two
-directions badly, once in 5,000 scans."""
+_CERTAINTY = 5.2
+"""Standard deviations beyond which a direction alarms: 4.2 would be once in 5,000 scans of four
+cameras that each see two directions badly, and a direction that is seen badly errs by up to one
+standard deviation on the average, for a person hides other places in every scan."""
 _GUARD_M = 0.001
 """Nothing smaller alarms however certain it is: warmth, the sensor's own steps."""
 _POWER = 2.0
