@@ -29,6 +29,8 @@ _ROUNDS_A_RING = 4
 _HOPELESS = 120
 """Triangles of one place that still cross by then: no flattening parts them."""
 _SWEEPS = 8
+_DEEPEST_M = 0.030
+"""No two limbs of a body are farther inside each other than flesh gives way."""
 _FLATTENING = 0.75
 """Share of the way to the neighbours' mean that a stubborn vertex goes in one round."""
 
@@ -83,7 +85,9 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
         asking = np.asarray(moved[faces].any(axis=1))
     else:
         bad = _bad(current, reference, faces, asking)
-    return _restored(current, gentle, np.unique(faces[bad | given_up]), mean)
+    spoiled = np.linalg.norm(current - gentle, axis=1) > _DEEPEST_M
+    spoiled[faces[bad | given_up]] = True
+    return _restored(current, gentle, np.flatnonzero(spoiled), mean)
 
 
 def _bad(vertices: Array, reference: Array, faces: Faces, asking: Mask) -> Mask:
@@ -107,7 +111,7 @@ def _in_large_places(faces: Faces, bad: Mask, mean: sp.csr_matrix) -> Mask:
 
 
 def _restored(
-    vertices: Array, before: Array, corners: NDArray[np.int32], mean: sp.csr_matrix
+    vertices: Array, before: Array, corners: NDArray[np.intp], mean: sp.csr_matrix
 ) -> Array:
     """The surface with those moved places as before that hold one of the corners."""
     moved = np.flatnonzero((vertices != before).any(axis=1))
