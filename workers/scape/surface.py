@@ -3,8 +3,9 @@ model where nobody looked (the paper's E(Y'), with weights from the measured noi
 
     min_s  sum_v w_v (s_v - r_v)^2 + stiffness s^T L s,      Y' = Y + s n
 
-w_v and r_v gather all points that belong to vertex v; L is the template's Laplacian, so the field
-is smooth and fades over what no camera saw. Conjugate gradients from the last round's field.
+w_v and r_v gather all points that belong to vertex v; L is the template's graph Laplacian, so the
+field is smooth and fades over what no camera saw. Every round sets out from the last one's surface,
+with a narrower gate and less stiffness.
 """
 
 from __future__ import annotations
@@ -63,8 +64,6 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
-    weight = np.zeros(len(vertices))
-    residual = np.zeros(len(vertices))
     for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
         normals = vertex_normals(current, model.faces)
         residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
