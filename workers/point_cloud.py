@@ -81,7 +81,7 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
     vertices, corners = _obj(path) if path.suffix.lower() == ".obj" else _ply(path)
     if not len(corners) or not np.isfinite(vertices).all():
         raise InputError(f"{path} holds no usable mesh; give a .ply or .obj of triangles")
-    if not np.array_equal(corners, faces):
+    if not np.array_equal(corners, faces) or len(vertices) != faces.max() + 1:
         raise InputError(
             f"{path} has {len(vertices)} vertices and {len(corners)} triangles that are not the "
             f"template's {faces.max() + 1} and {len(faces)}; fit it first: "

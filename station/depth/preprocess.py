@@ -105,7 +105,9 @@ def warm_up() -> None:
     """Compile (or load from the cache) what the first scan would otherwise wait for."""
     average(np.zeros((3, 2, 2), np.uint16), 1e-4)
     nothing = np.zeros((1, 1, 3), np.float32)
-    within(nothing, nothing[..., 0], np.eye(4), np.zeros(3), np.zeros(3))
+    # As `rays` gives them: what may be written to is another type, compiled apart.
+    nothing.flags.writeable = False
+    within(nothing, np.zeros((1, 1), np.float32), np.eye(4), np.zeros(3), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)

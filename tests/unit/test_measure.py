@@ -287,6 +287,10 @@ def test_a_results_tables_are_printed_with_their_intervals(
 def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_path: Path) -> None:
     (tmp_path / "cut.ply").write_bytes(ply_mesh(model.mean, model.faces[:-5]))
     (tmp_path / "text.obj").write_text("v one two three\n")
+    whole = obj_mesh(model.mean, model).decode().splitlines()
+    first = next(i for i, line in enumerate(whole) if line.startswith("v "))
+    (tmp_path / "short.obj").write_text("\n".join(whole[:first] + whole[first + 1 :]))
+    (tmp_path / "long.obj").write_text("\n".join([*whole, "v 0 0 1"]))
     for name, vertices in (
         ("millimetres.obj", 1e3 * model.mean),
         ("lying.obj", model.mean[:, [0, 2, 1]]),
@@ -298,6 +302,8 @@ def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_
         ("lying.obj", "another axis up"),
         ("floating.obj", "soles at 0.5"),
         ("cut.ply", "fit it first"),
+        ("short.obj", "fit it first"),
+        ("long.obj", "fit it first"),
         ("text.obj", "no usable mesh"),
         ("missing.ply", "not a file"),
         (".", "has no measurements.json"),

@@ -2,16 +2,20 @@
 
 import json
 import shutil
+from importlib import import_module
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
 from station.bundle import read_bundle
+from station.calibration.rig import CameraCalibration
+from station.calibration.sensor_noise import RANDOM_SIGMA, STEP
 from station.depth import Volume, preprocess
 from station.depth.average import average
 from station.depth.people import count_people
-from station.depth.points import normals, project, rays
+from station.depth.points import normals, project, rays, within
 from station.drivers.virtual import SimulatedBooth, render_bundle
 from station.drivers.virtual_scene import Mesh, chair, default_rig, load_mesh
 from station.errors import InputError
@@ -35,6 +39,70 @@ def test_a_flickering_pixel_is_no_reading() -> None:
     averaged = average(stack, 1e-4)
     assert averaged.depth_m[0, 0] == 0.0
     assert averaged.depth_m[0, 1] > 0.0
+
+
+@pytest.mark.parametrize("frames", [1, 4, 9])
+def test_averages_are_what_their_definition_says(frames: int) -> None:
+    """Where the extremes agree no median is looked for; the result is the same."""
+    rng = np.random.default_rng(frames)
+    spread = rng.choice([2.0, 60.0, 400.0], (1, 8, 40))
+    stack = np.round(15_000 + spread * rng.standard_normal((frames, 8, 40))).astype(np.uint16)
+    stack[rng.random(stack.shape) < 0.2] = 0
+    averaged = average(stack, 1e-4)
+    least = int(np.ceil(0.4 * frames))
+    for y, x in np.ndindex(8, 40):
+        values = 1e-4 * stack[:, y, x].astype(float)
+        readings = values[values > 0.0]
+        if len(readings) < least:
+            assert averaged.depth_m[y, x] == averaged.count[y, x] == 0
+            continue
+        middle = np.median(readings)
+        gate = (3.0 * RANDOM_SIGMA + STEP) * middle**2
+        good = (values > 0.0) & (np.abs(values - middle) <= gate)
+        stray = len(readings) - good.sum() >= 2
+        assert averaged.unsettled_m[y, x] == pytest.approx(middle if stray else 0.0)
+        assert averaged.count[y, x] == (good.sum() if good.sum() >= least else 0)
+        if good.sum() >= least:
+            assert averaged.depth_m[y, x] == pytest.approx(values[good].mean(), rel=1e-5)
+
+
+def _box_by_matrices(
+    camera: CameraCalibration, depth_m: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    pose = camera.world_from_camera
+    world = (rays(camera) * depth_m[..., None]).astype(float) @ pose[:3, :3].T + pose[:3, 3]
+    return np.asarray((depth_m > 0) & (world > low).all(axis=2) & (world < high).all(axis=2))
+
+
+def test_the_volume_is_a_box_of_the_world() -> None:
+    rng = np.random.default_rng(0)
+    low, high = np.array([-0.6, -0.5, 0.3]), np.array([0.5, 0.6, 1.7])
+    for camera in default_rig().cameras.values():
+        depth = rng.uniform(0.5, 3.0, (camera.height, camera.width)).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.1] = 0.0
+        depth[0, 0] = np.nan
+        found = within(rays(camera), depth, camera.world_from_camera, low, high)
+        expected = _box_by_matrices(camera, depth, low, high)
+        # A point on a face may fall to either side of it.
+        assert found.any()
+        assert (found != expected).sum() < 5
+
+
+def test_warming_up_compiles_what_a_scan_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A read-only array is another type to the compiler than the same that can be written to."""
+    module = import_module("station.depth.preprocess")
+    called: list[tuple[numba.types.Type, ...]] = []
+
+    def watched(*arguments: np.ndarray) -> np.ndarray:
+        called.append(tuple(numba.typeof(argument) for argument in arguments))
+        return np.asarray(within(*arguments))
+
+    monkeypatch.setattr(module, "within", watched)
+    module.warm_up()
+    camera = default_rig().cameras["front-upper"]
+    depth = camera.depth_correction.apply(np.full((camera.height, camera.width), 1.5, np.float32))
+    module._in_volume(camera, depth.astype(np.float32), Volume())
+    assert called[1] == called[0]
 
 
 def test_projection_inverts_the_rays() -> None:

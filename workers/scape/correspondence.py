@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from workers.scape.deformation import Faces, neighbours
+from workers.scape.deformation import Graph
 from workers.scape.kernels import descend
 
 Array = NDArray[np.float64]
@@ -66,16 +66,17 @@ class OrientedTree:
 class Followers:
     """Oriented points (n, 3) that keep their vertex while one surface moves beneath them.
 
-    They are searched for in the whole surface once. After that, each looks for a nearer vertex
-    among the neighbours of its last, and on from there. Dense points in the order of an image are
-    quicker: they set out from the vertex that was found for one a few places before them.
+    They are searched for in the whole surface once; who finds nothing within the limits then is
+    left out for good. After that, each looks for a nearer vertex among the neighbours of its last,
+    and on from there: in a fold it may stop short of the nearest. Dense points in the order of an
+    image are quicker: they set out from the vertex that was found for one a few places before them.
     """
 
-    def __init__(self, faces: Faces, points: Array, normals: Array, *, dense: bool = False) -> None:
+    def __init__(self, graph: Graph, points: Array, normals: Array, *, dense: bool = False) -> None:
         self.points, self.normals = points, normals
         self._scouts = _SCOUT_EVERY if dense else 1
         self._place = _joined(points, normals)
-        self._graph = neighbours(faces)
+        self._graph = graph
         self._vertex: NDArray[np.intp] | None = None
 
     def pairs(

@@ -18,6 +18,8 @@ from workers.scape import kernels
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
+Graph = tuple[NDArray[np.int32], NDArray[np.int32]]
+"""Where each vertex' neighbours begin (P + 1,), and all of them."""
 
 _PINNED = 0
 """A Laplacian leaves the translation free: this vertex stays where the input has it."""
@@ -60,8 +62,8 @@ def vertex_normals(vertices: Array, faces: Faces) -> Array:
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
-def neighbours(faces: Faces) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Vertices joined by an edge: where each one's begin (P + 1,), and all of them."""
+def neighbours(faces: Faces) -> Graph:
+    """Vertices joined by an edge."""
     tail = np.concatenate([faces.ravel(), np.roll(faces, -1, axis=1).ravel()])
     head = np.concatenate([np.roll(faces, -1, axis=1).ravel(), faces.ravel()])
     graph = sp.csr_matrix((np.ones(len(tail), bool), (tail, head)))

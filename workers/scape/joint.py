@@ -3,6 +3,7 @@
 Every correspondence is a point p, a vertex v and the vertex' normal n; its residual n . (p - y_v)
 is exact, its derivative that of the sample vertex nearest to v on the template. Rows of one sample
 share a derivative J_s (3 x D), so they add up to a 3 x 3 weight before anything is multiplied.
+While the fit is coarse, some sample vertices stand for the whole skin.
 """
 
 from __future__ import annotations
@@ -203,7 +204,7 @@ def fit_jointly(
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
     pulled = target.pulled
-    followers = Followers(model.faces, target.tree.points[pulled], target.tree.normals[pulled])
+    followers = Followers(model.neighbours, target.tree.points[pulled], target.tree.normals[pulled])
     terms: _DataTerms | None = None
     with ThreadPoolExecutor(max_workers=1) as beside:
         for step, stage in enumerate(schedule):

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from station.errors import FormatError
 from station.geometry import nearest_rotation, so3_exp, so3_log
-from workers.scape.deformation import EdgeSolver, Faces, edges, vertex_areas
+from workers.scape.deformation import EdgeSolver, Faces, Graph, edges, neighbours, vertex_areas
 from workers.scape.sampled import SampledBody
 
 FORMAT = "booth-body-model"
@@ -100,6 +100,10 @@ class BodyModel:
     @cached_property
     def solver(self) -> EdgeSolver:
         return EdgeSolver.build(self.mean, self.faces)
+
+    @cached_property
+    def neighbours(self) -> Graph:
+        return neighbours(self.faces)
 
     @cached_property
     def triangle_part_weights(self) -> Array:

@@ -3,8 +3,9 @@ model where nobody looked (the paper's E(Y'), with weights from the measured noi
 
     min_s  sum_v w_v (s_v - r_v)^2 + stiffness s^T L s,      Y' = Y + s n
 
-w_v and r_v gather all points that belong to vertex v; L is the template's Laplacian, so the field
-is smooth and fades over what no camera saw. Conjugate gradients from the last round's field.
+w_v and r_v gather all points that belong to vertex v; L is the template's graph Laplacian, so the
+field is smooth and fades over what no camera saw. Every round sets out from the last one's surface,
+with a narrower gate and less stiffness.
 """
 
 from __future__ import annotations
@@ -58,13 +59,11 @@ class SurfaceFit:
 def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
     """Lay the model's surface (P, 3) on the cloud's points."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    followers = Followers(model.faces, cloud.points[every], cloud.normals[every], dense=True)
+    followers = Followers(model.neighbours, cloud.points[every], cloud.normals[every], dense=True)
     noise = cloud.sigma_m[every]
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
-    weight = np.zeros(len(vertices))
-    residual = np.zeros(len(vertices))
     for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
         normals = vertex_normals(current, model.faces)
         residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)

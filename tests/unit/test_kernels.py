@@ -1,0 +1,185 @@
+"""Compiled loops do what a line of numpy says, and followers find what a search finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+from station.drivers.virtual_scene import sphere
+from workers.scape.correspondence import Followers, OrientedTree
+from workers.scape.deformation import EdgeSolver, area_vectors, edges, neighbours, vertex_normals
+from workers.scape.initial import posed, starting_states
+from workers.scape.kernels import conjugate_gradients, descend, trimmed_costs
+from workers.scape.model import BodyModel, load_model
+
+LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
+BALL = sphere((0.1, 0.2, 1.0), 0.3)
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+def test_normals_are_sums_of_cross_products() -> None:
+    a, b, c = (BALL.vertices[BALL.faces[:, i]] for i in range(3))
+    expected = np.cross(b - a, c - a)
+    assert np.allclose(area_vectors(BALL.vertices, BALL.faces), expected, atol=1e-15)
+    summed = np.zeros_like(BALL.vertices)
+    for corner in range(3):
+        np.add.at(summed, BALL.faces[:, corner], expected)
+    summed /= np.linalg.norm(summed, axis=1, keepdims=True)
+    assert np.allclose(vertex_normals(BALL.vertices, BALL.faces), summed, atol=1e-12)
+
+
+def test_triangles_without_their_vertices_are_an_error() -> None:
+    with pytest.raises(IndexError, match="triangles name vertex"):
+        vertex_normals(BALL.vertices[:-1], BALL.faces)
+
+
+def test_a_surface_is_carried_by_its_turned_edges() -> None:
+    rng = np.random.default_rng(0)
+    matrices = rng.standard_normal((len(BALL.faces), 3, 3))
+    solver = EdgeSolver.build(BALL.vertices, BALL.faces)
+    surface = BALL.vertices + 0.01 * rng.standard_normal(BALL.vertices.shape)
+    expected = solver.vertices(edges(surface, BALL.faces) @ np.swapaxes(matrices, 1, 2))
+    assert np.allclose(solver.carried(surface, matrices), expected, atol=1e-10)
+
+
+def test_conjugate_gradients_solve_what_a_factorisation_solves() -> None:
+    rng = np.random.default_rng(1)
+    links = sp.random(80, 80, 0.05, random_state=1, format="csr")
+    links = links + links.T
+    degree = np.asarray(links.sum(axis=1)).ravel()
+    matrix = (sp.diags(degree + rng.uniform(0.01, 1.0, 80)) - links).tocsr()
+    right = rng.standard_normal(80)
+    system = (matrix.indptr, matrix.indices, matrix.data)
+    found = conjugate_gradients(*system, right, 1e-10, 500)
+    assert np.allclose(found, spsolve(matrix.tocsc(), right), atol=1e-7)
+    coarse = conjugate_gradients(*system, right, 1e-2, 500)
+    assert np.linalg.norm(matrix @ coarse - right) <= 1.01e-2 * np.linalg.norm(right)
+    assert not conjugate_gradients(*system, np.zeros(80), 1e-2, 500).any()
+
+
+@pytest.mark.parametrize("size", [3, 6])
+def test_trimmed_costs_are_trimmed_means_both_ways(size: int) -> None:
+    rng = np.random.default_rng(size)
+    tried = rng.uniform(0.0, 1.0, (4, size, 30)).astype(np.float32)
+    cloud = rng.uniform(0.0, 1.0, (50, size)).astype(np.float32)
+    found = trimmed_costs(tried, cloud, 0.2, 0.3, 0.5)
+    for points, cost in zip(tried, found, strict=True):
+        away = np.linalg.norm(cloud[:, None] - points.T[None], axis=2)
+        there = np.minimum(away.min(axis=1), 0.2).mean()
+        back = np.minimum(away.min(axis=0), 0.3).mean()
+        assert cost == pytest.approx(there + 0.5 * back, rel=1e-5)
+
+
+def test_downhill_ends_where_no_neighbour_is_nearer() -> None:
+    rng = np.random.default_rng(2)
+    first, joined = neighbours(BALL.faces)
+    points = BALL.vertices.mean(axis=0) + 0.4 * rng.standard_normal((300, 3))
+    start = rng.integers(0, len(BALL.vertices), 300)
+    found = descend(points, BALL.vertices, first, joined, start)
+
+    def away(index: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points - BALL.vertices[index], axis=1)
+
+    assert (away(found) <= away(start)).all()
+    for point, vertex in zip(points, found, strict=True):
+        around = BALL.vertices[joined[first[vertex] : first[vertex + 1]]]
+        least = np.linalg.norm(point - BALL.vertices[vertex])
+        assert (np.linalg.norm(around - point, axis=1) >= least - 1e-12).all()
+    # A ball has no hollow in which to stop short.
+    outside = BALL.vertices[start] + 0.01 * vertex_normals(BALL.vertices, BALL.faces)[start]
+    assert np.array_equal(
+        descend(outside, BALL.vertices, first, joined, rng.permutation(start)), start
+    )
+
+
+def _skin_points(
+    model: BodyModel, vertices: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly over a body, 3 mm off it, in no order, and their normals."""
+    rng = np.random.default_rng(3)
+    size = np.linalg.norm(area_vectors(vertices, model.faces), axis=1)
+    corners = model.faces[rng.choice(len(size), count, p=size / size.sum())]
+    weight = rng.dirichlet((1.0, 1.0, 1.0), count)
+    normals = vertex_normals(vertices, model.faces)[corners]
+    direction = np.einsum("nc,nci->ni", weight, normals)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return np.einsum("nc,nci->ni", weight, vertices[corners]) + 0.003 * direction, direction
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_followers_find_what_a_search_finds(model: BodyModel, dense: bool) -> None:
+    """At once, and after the surface has moved a little; far points find nothing."""
+    normals = vertex_normals(model.mean, model.faces)
+    points, directions = _skin_points(model, model.mean, 6000)
+    points[:10] += 0.5
+    followers = Followers(model.neighbours, points, directions, dense=dense)
+    for shift_m in (0.0, 0.003):
+        moved = model.mean + np.array([shift_m, -shift_m, 0.0])
+        used, vertex = followers.pairs(moved, normals, **LIMITS)
+        asked, nearest = OrientedTree.build(moved, normals).pairs(points, directions, **LIMITS)
+        assert used.min() >= 10
+        assert abs(len(used) - len(asked)) < 0.005 * len(asked)
+        _, mine, theirs = np.intersect1d(used, asked, return_indices=True)
+        same = vertex[mine] == nearest[theirs]
+        # A fold can hold back who comes from beside it: lips, ears, toes, fingers.
+        assert same.all() if shift_m == 0.0 and not dense else same.mean() > 0.97
+
+
+def test_a_scout_led_astray_does_not_mislead(model: BodyModel) -> None:
+    """One point of four has a vertex to set out from; what it cannot reach is searched for."""
+    normals = vertex_normals(model.mean, model.faces)
+    points, directions = _skin_points(model, model.mean, 400)
+    points[::4] += 0.5
+    used, _ = Followers(model.neighbours, points, directions, dense=True).pairs(
+        model.mean, normals, **LIMITS
+    )
+    asked, _ = OrientedTree.build(model.mean, normals).pairs(points, directions, **LIMITS)
+    assert np.array_equal(used, asked)
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_no_points_follow_nothing(dense: bool) -> None:
+    normals = vertex_normals(BALL.vertices, BALL.faces)
+    followers = Followers(neighbours(BALL.faces), np.empty((0, 3)), np.empty((0, 3)), dense=dense)
+    for _ in range(2):
+        used, vertex = followers.pairs(BALL.vertices, normals, **LIMITS)
+        assert len(used) == len(vertex) == 0
+
+
+def test_positions_alone_are_those_of_the_derivative(model: BodyModel) -> None:
+    samples = model.at(np.arange(0, model.vertex_count, 211))
+    rng = np.random.default_rng(4)
+    beta = rng.standard_normal(model.beta_count)
+    beta[40:] = 0.0
+    twists = 0.2 * rng.standard_normal((model.part_count, 3))
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists), beta=beta)
+    for shapes in (None, 6, 40):
+        positions, derivative = samples.jacobian(state, shapes)
+        assert derivative.shape[2] == 3 * model.part_count + (shapes or model.beta_count) + 3
+        assert np.allclose(positions, samples.evaluate(state), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("arms_deg", "heading_deg"),
+    [((12.0, 12.0), 0.0), ((84.0, 84.0), 0.0), ((20.0, 75.0), -12.0)],
+)
+def test_the_start_has_the_arms_where_the_cloud_has_them(
+    model: BodyModel, arms_deg: tuple[float, float], heading_deg: float
+) -> None:
+    state = posed(model, model.neutral_state(), arms_deg, (0.0, 0.0), np.radians(heading_deg))
+    vertices = model.vertices(state)
+    vertices[:, 2] -= vertices[:, 2].min()
+    scout = model.at(np.arange(0, model.vertex_count, 53))
+    cloud, _ = _skin_points(model, vertices, 800)
+    best = model.vertices(starting_states(model, scout, cloud)[0])
+    for side in ("left", "right"):
+        hand = model.part_of_vertex == model.part_names.index(f"hand_{side}")
+        assert np.linalg.norm((best - vertices)[hand].mean(axis=0)) < 0.2
