@@ -10,7 +10,8 @@ import open3d as o3d
 import pytest
 
 from station.bundle import read_bundle
-from station.depth import preprocess
+from station.depth import PointCloud, Preprocessed, preprocess
+from workers.scape.deformation import vertex_normals
 from workers.scape.fit import FitResult, fit_body
 from workers.scape.intersections import self_intersections, turned_over
 from workers.scape.model import BodyModel, load_model
@@ -85,3 +86,20 @@ def test_the_paper_method_gives_a_body_too(model: BodyModel, bundle: Path) -> No
     result = fit_body(model, preprocess(read_bundle(bundle)), method="paper")
     truth = np.load(BODIES / "ben.npz")["vertices"]
     assert np.sqrt(np.mean(_distance_to(result.vertices, model.faces, truth) ** 2)) < 0.09
+
+
+def test_half_a_body_is_no_confident_one(model: BodyModel) -> None:
+    """Every part of it is half seen, so the parts alone would not tell."""
+    normals = vertex_normals(model.mean, model.faces)
+    front = normals[:, 1] < 0.0
+    count = int(front.sum())
+    cloud = PointCloud(
+        model.mean[front],
+        normals[front],
+        np.full(count, 1e-3),
+        np.zeros(count, np.int16),
+        ("cloud",),
+    )
+    verdict = fit_body(model, Preprocessed(cloud, (), ())).verdict
+    assert verdict.status == "rescan"
+    assert any("back not seen" in reason for reason in verdict.reasons)

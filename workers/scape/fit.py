@@ -38,6 +38,7 @@ from workers.scape.verdict import (
     Verdict,
     judge,
     report_parts,
+    sides_seen,
     unexplained_share,
 )
 
@@ -143,7 +144,8 @@ def _fit(
     parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
     shifts = cameras.shifts_m(scan.cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
-    verdict = judge(parts, scan.findings, unexplained, stature_m, state.beta, shifts)
+    sides = sides_seen(model, surface.vertices, surface.seen)
+    verdict = judge(parts, sides, scan.findings, unexplained, stature_m, state.beta, shifts)
     # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
     # the same scan gives the same file.
     delivered = np.round(surface.vertices, 7)

@@ -26,6 +26,10 @@ _CAMERA_SHIFT_M = 0.002
 """Rightly placed cameras are moved by tenths of a millimetre, one that is 5 mm off by 3 or more."""
 _STATURE_M = (1.30, 2.25)
 _IMPLAUSIBLE_BETA = 6.0
+_TRUNK = ("pelvis", "abdomen", "chest")
+_SIDES = {"front": -1.0, "back": 1.0}
+"""Of a person on the mark, who faces -y."""
+_FACING = 0.7
 _HAND = ("hand", "thumb", "fingers")
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
@@ -77,6 +81,21 @@ def report_parts(
     return tuple(reports), rms, float(unexplained.mean())
 
 
+def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
+    """Shares of the trunk's front and back that cameras saw.
+
+    A part that is seen from one side alone may still be seen by half.
+    """
+    areas = vertex_areas(vertices, model.faces)
+    toward = vertex_normals(vertices, model.faces)[:, 1]
+    trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
+    shares = {}
+    for side, sign in _SIDES.items():
+        there = trunk & (sign * toward > _FACING)
+        shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
+    return shares
+
+
 def _unmet(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
     """A few stray points are noise; a cluster of them is a limb that the fit lost."""
     lost = int(np.count_nonzero(around & unexplained))
@@ -111,6 +130,7 @@ def _groups(model: BodyModel) -> dict[str, list[int]]:
 
 def judge(
     parts: Sequence[PartReport],
+    sides: dict[str, float],
     findings: Sequence[Finding],
     unexplained: float,
     stature_m: float,
@@ -128,6 +148,9 @@ def judge(
         reasons.append(f"the body is {stature_m:.2f} m tall; only adults can be measured")
     if float(np.abs(beta[:10]).max(initial=0.0)) > _IMPLAUSIBLE_BETA:
         reasons.append("what stands in the booth does not look like a person")
+    for side, share in sides.items():
+        if share < _SEEN_ENOUGH:
+            reasons.append(f"the person's {side} not seen ({100 * share:.0f} % of it)")
     for part in parts:
         stem, _, side = part.name.rpartition("_")
         words = f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part.name
