@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.scape.joint import Sampling
 from workers.scape.model import BodyModel, BodyState, load_model
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.registration import distances, register
+from workers.scape.sampling import Sampling
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
 

@@ -6,12 +6,12 @@ from station.drivers.virtual_scene import sphere
 from workers.measure.sections import (
     EdgeNet,
     EdgePoints,
-    enclosed_volume,
     hull_order,
     loop_length,
     plane_axes,
     surface_order,
 )
+from workers.scape.deformation import signed_volume
 
 TILTED = np.array([0.6, 0.0, 0.8])
 UP = np.array([0.0, 0.0, 1.0])
@@ -111,6 +111,4 @@ def test_axes_of_a_plane_are_square_to_it() -> None:
 
 def test_a_spheres_volume() -> None:
     ball = sphere((0.3, -0.2, 1.0), 0.1)
-    assert enclosed_volume(ball.vertices, ball.faces) == pytest.approx(
-        4 / 3 * np.pi * 1e-3, rel=0.02
-    )
+    assert signed_volume(ball.vertices, ball.faces) == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.02)

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workers.measure.intervals import Pose, content_interval, intervals, row_values
-from workers.measure.sections import enclosed_volume
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import trace_all
-from workers.scape.deformation import triangle_areas
+from workers.scape.deformation import signed_volume, triangle_areas
 from workers.scape.model import BodyModel, BodyState
 
 Array = NDArray[np.float64]
@@ -96,7 +95,7 @@ def _measured(
             traces, row_values(traces, pose), intervals(traces, vertex_sigma_m, pose), strict=True
         )
     )
-    volume = enclosed_volume(vertices, model.faces)
+    volume = signed_volume(vertices, model.faces)
     surface = float(triangle_areas(vertices, model.faces).sum())
     return MeasuredBody(
         pose,

@@ -188,9 +188,3 @@ def _turns_left(
     a: tuple[float, float, int], b: tuple[float, float, int], c: tuple[float, float, int]
 ) -> bool:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0
-
-
-def enclosed_volume(vertices: Array, faces: Faces) -> float:
-    """Volume (m3) of a closed mesh with outward faces: the sum of signed tetrahedra."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return float(np.einsum("ki,ki->", a, np.cross(b, c)) / 6.0)

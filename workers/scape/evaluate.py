@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from station.errors import FormatError
 from workers.scape.database import BodyDatabase
 from workers.scape.deformation import vertex_areas
-from workers.scape.joint import Sampling
 from workers.scape.model import BodyModel, BodyState, load_model
 from workers.scape.pictures import draw_case, draw_components
 from workers.scape.population import population_table
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.registration import distances, register
 from workers.scape.resources import SAMPLES, measure_resources
+from workers.scape.sampling import Sampling
 
 Array = NDArray[np.float64]
 

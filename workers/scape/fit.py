@@ -24,7 +24,6 @@ from workers.scape.joint import (
     FINE,
     MIDDLE,
     JointResult,
-    Sampling,
     Target,
     even_subset,
     fit_jointly,
@@ -32,6 +31,7 @@ from workers.scape.joint import (
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
+from workers.scape.sampling import Sampling
 from workers.scape.surface import fit_surface
 from workers.scape.verdict import (
     PartReport,

@@ -15,20 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
 from workers.scape.cameras import CameraCorrections
 from workers.scape.correspondence import Followers, OrientedTree
-from workers.scape.deformation import vertex_areas, vertex_normals
 from workers.scape.free_space import FreeSpace
-from workers.scape.hands import Hand, hands_of
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
-from workers.scape.sampled import SampledBody, twist_chain
-from workers.scape.spread import farthest_first
+from workers.scape.sampled import twist_chain
+from workers.scape.sampling import COARSE_SAMPLES, FINE_SAMPLES, Sampling
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -37,7 +34,6 @@ _MODEL_SIGMA_M = 0.003
 """What shape and pose cannot express; it is shared by neighbours, so rows count less."""
 _TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
-_COARSE, _SCOUTS, _FINE = 600, 1200, 2000
 _PULLED_POINTS = 10_000
 _COARSELY_PULLED = 4
 """While the fit is coarse, every so many of them."""
@@ -62,7 +58,7 @@ class Stage:
     @property
     def coarse(self) -> bool:
         """Whether samples stand for the whole skin."""
-        return self.samples == _COARSE
+        return self.samples == COARSE_SAMPLES
 
     @property
     def limits(self) -> dict[str, float]:
@@ -71,78 +67,12 @@ class Stage:
 
 
 COARSE = (
-    *(Stage(_COARSE, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
-    *(Stage(_COARSE, 16, 0.12, np.radians(65), 0.030, 0.06) for _ in range(4)),
-    *(Stage(_COARSE, 40, 0.08, np.radians(55), 0.018, 0.06) for _ in range(3)),
+    *(Stage(COARSE_SAMPLES, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
+    *(Stage(COARSE_SAMPLES, 16, 0.12, np.radians(65), 0.030, 0.06) for _ in range(4)),
+    *(Stage(COARSE_SAMPLES, 40, 0.08, np.radians(55), 0.018, 0.06) for _ in range(3)),
 )
-MIDDLE = tuple(Stage(_FINE, _EVERY, 0.05, np.radians(45), 0.010, 0.06) for _ in range(2))
-FINE = tuple(Stage(_FINE, _EVERY, 0.03, np.radians(40), 0.006, 0.60) for _ in range(3))
-
-
-@dataclass(frozen=True, slots=True)
-class Sampling:
-    """Nested sample vertices with the model's derivatives, and who stands for whom."""
-
-    body: SampledBody
-    scouts: SampledBody
-    """The first ones: all the skin that the coarse stages look at."""
-    normals: Array
-    """(m, 3): of the scouts, on the mean body."""
-    share: Array
-    """(m,): the area that each scout stands for, in those of an average vertex."""
-    coarse_of_scout: NDArray[np.intp]
-    sample_of_vertex: NDArray[np.intp]
-    hands: tuple[Hand, ...]
-
-    @classmethod
-    def build(cls, model: BodyModel) -> Sampling:
-        """Samples spread evenly; the first ones alone are spread evenly too."""
-        order = _spread(model)
-        places = model.mean[order]
-        scouts = places[:_SCOUTS]
-        scout_of_vertex = cKDTree(scouts).query(model.mean)[1]
-        body = model.at(order)
-        return cls(
-            body,
-            body.first(_SCOUTS),
-            vertex_normals(model.mean, model.faces)[order[:_SCOUTS]],
-            np.bincount(scout_of_vertex, model.vertex_shares, _SCOUTS).astype(np.float64),
-            cKDTree(places[:_COARSE]).query(scouts)[1],
-            cKDTree(places).query(model.mean)[1],
-            hands_of(model),
-        )
-
-    def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
-        """The scouts, their normals turned with the parts."""
-        index = self.scouts.indices
-        turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
-        normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
-        return Skin(
-            self.scouts.evaluate(state),
-            normals / np.linalg.norm(normals, axis=1, keepdims=True),
-            model.part_of_vertex[index],
-            self.share,
-            self.coarse_of_scout,
-        )
-
-    def skin(self, model: BodyModel, state: BodyState) -> Skin:
-        """Every vertex."""
-        vertices = model.vertices(state)
-        return Skin(
-            vertices,
-            vertex_normals(vertices, model.faces),
-            model.part_of_vertex,
-            model.vertex_shares,
-            self.sample_of_vertex,
-        )
-
-
-def _spread(model: BodyModel) -> NDArray[np.int64]:
-    """Farthest-point order on the mean body, started from a fixed vertex; the soles' and the
-    face's folds count by area, so that neither takes all the samples."""
-    areas = np.sqrt(vertex_areas(model.mean, model.faces))
-    reach = np.minimum(areas / np.median(areas), 1.0)
-    return farthest_first(model.mean, _FINE, start=model.landmarks["crown"], reach=reach)
+MIDDLE = tuple(Stage(FINE_SAMPLES, _EVERY, 0.05, np.radians(45), 0.010, 0.06) for _ in range(2))
+FINE = tuple(Stage(FINE_SAMPLES, _EVERY, 0.03, np.radians(40), 0.006, 0.60) for _ in range(3))
 
 
 @dataclass(frozen=True, slots=True)

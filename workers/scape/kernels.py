@@ -9,14 +9,7 @@ import numpy as np
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
-    starts,
-    parts,
-    mean,
-    shape,
-    twist_starts,
-    twist_parts,
-    twist_joints,
-    twist_blocks,
+    blocks,
     parents,
     rotations,
     beta,
@@ -27,12 +20,9 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add what the blocks of every sample give to its position and derivative.
 
     Args:
-        starts: (n, 2) first and last + 1 of the sample's blocks.
-        parts: (m,) the part of a block.
-        mean: (m, 3) float32, B_p of the mean.
-        shape: (m, 3, B) float32, B_p of the components.
-        twist_starts, twist_parts, twist_joints, twist_blocks: (n, 2), (k,), (k,), (k, 3, 3), the
-            same for the relative twist of one joint.
+        blocks: (n, 2) first and last + 1 of each sample's blocks; (m,) the part of a block; (m, 3)
+            float32, B_p of the mean; (m, 3, B) float32, B_p of the components; then (n, 2), (k,),
+            (k,), (k, 3, 3), the same for the relative twist of one joint.
         parents: (L,).
         rotations: (L, 3, 3) float32.
         beta: (B',) float32, with B' >= the shapes that derivatives are wanted of.
@@ -40,6 +30,7 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
         positions: (n, 3) float64, in and out.
         derivative: (n, 3, 3 L + shapes + 3) float32, in and out.
     """
+    starts, parts, mean, shape, twist_starts, twist_parts, twist_joints, twist_blocks = blocks
     count = len(starts)
     first = 3 * len(rotations)
     shapes = derivative.shape[2] - first - 3
@@ -281,20 +272,14 @@ def conjugate_gradients(first, columns, values, right, tolerance, most):  # type
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def add_places(  # type: ignore[no-untyped-def]  # pragma: no cover
-    starts,
-    parts,
-    mean,
-    shape,
-    twist_starts,
-    twist_parts,
-    twist_joints,
-    twist_blocks,
+    blocks,
     rotations,
     beta,
     twists,
     positions,
 ):
     """What `add_blocks` adds to the positions alone."""
+    starts, parts, mean, shape, twist_starts, twist_parts, twist_joints, twist_blocks = blocks
     for v in range(len(starts)):
         for block in range(starts[v, 0], starts[v, 1]):
             part = parts[block]

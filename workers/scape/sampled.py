@@ -91,14 +91,7 @@ class SampledBody:
         arms = np.einsum("pij,gpj->gi", state.rotations, self.shared @ coefficients)
         positions = (arms + state.translation)[self.groups]
         add_places(
-            self.starts,
-            self.parts,
-            self.mean,
-            self.shape,
-            self.twist_starts,
-            self.twist_parts,
-            self.twist_joints,
-            self.twist_blocks,
+            self._blocks(),
             state.rotations.astype(np.float32),
             state.beta[: _used(state)].astype(np.float32),
             twists.astype(np.float32),
@@ -120,14 +113,7 @@ class SampledBody:
         positions, derivative = self._of_groups(state, twists, shapes)
         positions, derivative = positions[self.groups], derivative[self.groups]
         add_blocks(
-            self.starts,
-            self.parts,
-            self.mean,
-            self.shape,
-            self.twist_starts,
-            self.twist_parts,
-            self.twist_joints,
-            self.twist_blocks,
+            self._blocks(),
             model.part_parents,
             rotations.astype(np.float32),
             state.beta[: max(shapes, _used(state))].astype(np.float32),
@@ -136,6 +122,19 @@ class SampledBody:
             derivative,
         )
         return positions, derivative
+
+    def _blocks(self) -> tuple[NDArray[Any], ...]:
+        """As the kernels take them."""
+        return (
+            self.starts,
+            self.parts,
+            self.mean,
+            self.shape,
+            self.twist_starts,
+            self.twist_parts,
+            self.twist_joints,
+            self.twist_blocks,
+        )
 
     def _twists(self, state: BodyState) -> Array:
         """(L, 3): relative; the root's changes nothing of a body's form."""
