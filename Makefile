@@ -54,6 +54,8 @@ $(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
 
 $(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@echo "compiling what the first scan would otherwise wait for"
+	$(BIN)/python -c "from workers.job import warm_up; warm_up()"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml

@@ -131,6 +131,11 @@ def run(config_path: Path | None) -> None:
     path = find_config(config_path)
     config = load_config(path)
     lock = _only_one(config.runtime.folder)
+    click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
+    if not config.calibration.exists():
+        click.echo(
+            f"{config.calibration} is missing: station calibrate comes before the first scan"
+        )
     try:
         supervise(services(config, path.resolve()), stop_event())
     finally:

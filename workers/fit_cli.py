@@ -49,9 +49,11 @@ def fit(
       reconstruct fit BUNDLE --out result --debug pictures
     """
     if (bundle is None) == (cloud is None):
-        raise click.UsageError("give a bundle, or --cloud FILE")
+        raise click.UsageError("give a bundle or --cloud FILE: one of them")
     if out_folder.exists():
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
+    if debug_folder is not None and debug_folder.exists() and not debug_folder.is_dir():
+        raise InputError(f"{debug_folder} is not a folder; name one for the pictures with --debug")
     from workers import job
     from workers.point_cloud import read_cloud
     from workers.scape.model import load_model

@@ -18,12 +18,15 @@ _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
 _SIGMA_M = 0.001
 _STATURES_M = (1.0, 2.6)
+_UNSEEN_SOLES_M = 0.03
+"""A cloud that begins so little above its own z = 0 stands there: cameras see no soles."""
 _OFF_FLOOR_M = 0.05
 """How far a mesh's soles may be from the floor: heights are counted from there."""
 
 
 def read_cloud(path: Path, up: str) -> PointCloud:
-    """Read a cloud in metres; its lowest points become the floor, its middle the mark.
+    """Read a cloud in metres; its middle becomes the mark, and its lowest points the floor, unless
+    they lie as little above z = 0 as soles that no camera saw.
 
     Where that was in the file, after `up`, is the cloud's origin_m. The same file gives the same
     points.
@@ -54,7 +57,8 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     middle = np.median(points, axis=0)
     if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
         normals = -normals
-    middle[2] = points[:, 2].min()
+    low_m = float(points[:, 2].min())
+    middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
     x, y, z = (float(value) for value in middle)
     return PointCloud(
         points=points - middle,

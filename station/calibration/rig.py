@@ -142,6 +142,8 @@ class Rig:
         Raises:
             FormatError: naming the file, the camera and the field that cannot be used.
         """
+        if not path.exists():
+            raise FormatError(f"{path} is missing; a booth makes it with: station calibrate")
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         try:
             cameras = {

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+import pytest
 
 from workers import point_cloud
 from workers.point_cloud import read_cloud
@@ -31,3 +32,14 @@ def test_a_large_cloud_is_thinned_the_same_way_each_time(tmp_path: Path) -> None
     first, again = read_cloud(path, "z"), read_cloud(path, "z")
     assert len(first) == point_cloud._MOST_POINTS
     assert np.array_equal(first.points, again.points)
+
+
+@pytest.mark.parametrize(("low_m", "floor_m"), [(0.011, 0.0), (0.4, 0.4), (-0.9, -0.9)])
+def test_soles_that_no_camera_saw_are_not_the_floor(
+    tmp_path: Path, low_m: float, floor_m: float
+) -> None:
+    """Our own cloud.ply begins a centimetre above the floor it stands on."""
+    points = np.random.default_rng(1).uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 1.7), (500, 3))
+    points[:, 2] += low_m - points[:, 2].min()
+    cloud = read_cloud(_written(tmp_path / "cloud.ply", points), "z")
+    assert cloud.origin_m[2] == pytest.approx(floor_m, abs=1e-6)
