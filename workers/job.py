@@ -126,4 +126,5 @@ def _finish(
         standing = measure_standing(model, fit.overlapping, fit.state, fit.vertex_sigma_m)
     progress("writing", 0.0)
     write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
+    progress("done", 1.0)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)

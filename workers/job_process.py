@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ def _say(channel: int, message: dict[str, Any]) -> None:
 
 def main() -> None:
     die_with_parent()
+    # Ctrl-C on a terminal reaches the whole group; when to end is the pool's to say.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Libraries print to stdout; the pipe to the pool must hear this process alone.
     channel = os.dup(1)
     os.dup2(2, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -150,7 +150,6 @@ def _fit(
     # the same scan gives the same file.
     delivered = np.round(surface.vertices, 7)
     observer("done", {"vertices": delivered})
-    progress("done", 1.0)
     return FitResult(
         state=state,
         vertices=delivered,
@@ -195,7 +194,9 @@ def _best_start(
         if least < _EXPLAINED:
             break
     assert best is not None
+    done, steps = 0, len(MIDDLE) + len(FINE)
     for schedule in (MIDDLE, FINE):
+        share = len(schedule) / steps
         normals = vertex_normals(best.vertices, model.faces)
         state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
         best = fit_jointly(
@@ -205,10 +206,15 @@ def _best_start(
             state,
             best.cameras,
             schedule,
-            lambda share: progress("icp", share),
+            partial(_report, progress, done / steps, share),
             observer,
         )
+        done += len(schedule)
     return best
+
+
+def _report(progress: Progress, before: float, share: float, of_schedule: float) -> None:
+    progress("icp", before + share * of_schedule)
 
 
 def _refuse_absurd(cloud: PointCloud) -> None:
