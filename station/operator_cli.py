@@ -102,7 +102,9 @@ def status(config_path: Path | None, as_json: bool) -> None:
         return
     click.echo("sensors " + ("started" if content["streaming"] else "stopped"))
     for name, camera in content["sync"].get("cameras", {}).items():
-        words = "silent" if camera["silent"] else camera["state"]
+        # Sensors that were stopped are not amiss.
+        amiss = camera["silent"] and content["streaming"]
+        words = "silent" if amiss else camera["state"]
         click.echo(
             f"  {name:<16} {words:<10} {camera['frames']} frames, {camera['lost']} lost"
             + (f"  {camera['detail']}" if camera["detail"] else "")
