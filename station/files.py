@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import uuid
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from station.errors import FormatError
+from station.errors import BoothError, FormatError
 
 PRIVATE_FOLDER_MODE = 0o700
 """Body scans are personal data: nobody but the service's user reads them."""
@@ -37,6 +39,25 @@ def private_folder(folder: Path) -> Path:
     """Create a folder (and its parents) that only its owner may read."""
     folder.mkdir(mode=PRIVATE_FOLDER_MODE, parents=True, exist_ok=True)
     return folder
+
+
+@contextmanager
+def held(path: Path, busy: BoothError) -> Iterator[None]:
+    """Hold a lock file alone; leaving the block frees it, and so does the end of the process.
+
+    Raises:
+        BoothError: `busy`, where another process holds it.
+    """
+    private_folder(path.parent)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise busy from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

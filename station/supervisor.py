@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import subprocess
 import sys
 import threading
@@ -16,7 +14,7 @@ import click
 
 from station.config import BoothConfig, find_config, load_config
 from station.errors import BoothError
-from station.files import private_folder
+from station.files import held
 from station.service import die_with_parent, stop_event
 
 _BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -107,18 +105,6 @@ def supervise(table: list[Service], stop: threading.Event) -> None:
                 child.process.kill()
 
 
-def _only_one(folder: Path) -> int:
-    """A lock that is held for as long as this process lives."""
-    path = private_folder(folder) / "station.lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise BoothError(f"a station runs already in {folder}; stop it first") from None
-    return descriptor
-
-
 @click.command()
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
 def run(config_path: Path | None) -> None:
@@ -130,13 +116,12 @@ def run(config_path: Path | None) -> None:
     """
     path = find_config(config_path)
     config = load_config(path)
-    lock = _only_one(config.runtime.folder)
-    click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
-    if not config.calibration.exists():
-        click.echo(
-            f"{config.calibration} is missing: station calibrate comes before the first scan"
-        )
-    try:
+    folder = config.runtime.folder
+    busy = BoothError(f"a station runs already in {folder}; stop it first")
+    with held(folder / "station.lock", busy):
+        click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
+        if not config.calibration.exists():
+            click.echo(
+                f"{config.calibration} is missing: station calibrate comes before the first scan"
+            )
         supervise(services(config, path.resolve()), stop_event())
-    finally:
-        os.close(lock)

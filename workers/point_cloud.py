@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from station.depth import PointCloud
 from station.errors import InputError
+from workers.scape.verdict import POSSIBLE_HEIGHTS_M
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -17,7 +18,6 @@ Faces = NDArray[np.int32]
 _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
 _SIGMA_M = 0.001
-_STATURES_M = (1.0, 2.6)
 _UNSEEN_SOLES_M = 0.03
 """A cloud that begins so little above its own z = 0 stands there: cameras see no soles."""
 _OFF_FLOOR_M = 0.05
@@ -94,7 +94,7 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     low_m, high_m = float(vertices[:, 2].min()), float(vertices[:, 2].max())
-    if not _STATURES_M[0] < high_m - low_m < _STATURES_M[1]:
+    if not POSSIBLE_HEIGHTS_M[0] < high_m - low_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(
             f"{path} is {high_m - low_m:.4g} high with {up} up; metres were expected, or is "
             f"another axis up? see --up"

@@ -8,11 +8,9 @@ calibration.json                 a copy of the one in use
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,14 @@ from station.calibration.rig import Rig
 from station.calibration.scene import StaticView
 from station.calibration.session import SCENE
 from station.errors import CalibrationError
-from station.files import fsync_folder, private_folder, publish_folder, write_bytes, write_json
+from station.files import (
+    fsync_folder,
+    held,
+    private_folder,
+    publish_folder,
+    write_bytes,
+    write_json,
+)
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
 _ABANDONED, LOCK = "abandoned-", "calibrate.lock"
@@ -45,26 +50,14 @@ class CalibrationStore:
     folder: Path
     in_use: Path
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> AbstractContextManager[None]:
         """Hold the store alone: two that calibrate at once would write into one journal.
 
         Raises:
             CalibrationError: another process holds it.
         """
-        path = private_folder(self.folder) / LOCK
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise CalibrationError(
-                    f"another station calibrate is at work in {self.folder}; end it first"
-                ) from None
-            yield
-        finally:
-            # Closing frees it; so does the end of the process, whatever ended it.
-            os.close(descriptor)
+        busy = f"another station calibrate is at work in {self.folder}; end it first"
+        return held(self.folder / LOCK, CalibrationError(busy))
 
     @property
     def unfinished(self) -> Path:

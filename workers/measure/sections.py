@@ -176,15 +176,18 @@ def surface_order(points: Array, start: Array, end: Array, outward: Array, *, ta
     order = order[np.argsort(x[order], kind="stable")]
     if not taut:
         return order
-    kept: list[tuple[float, float, int]] = [(0.0, 0.0, -1)]
-    for candidate in [*zip(x[order], y[order], order.tolist(), strict=True), (length, 0.0, -1)]:
-        while len(kept) >= 2 and _turns_left(kept[-2], kept[-1], candidate):
-            kept.pop()
-        kept.append(candidate)
-    return np.array([index for _, _, index in kept[1:-1]], np.intp)
+    u, v = np.r_[0.0, x[order], length], np.r_[0.0, y[order], 0.0]
+    return np.asarray(order[_taut(u, v)[1:-1] - 1], np.intp)
 
 
-def _turns_left(
-    a: tuple[float, float, int], b: tuple[float, float, int], c: tuple[float, float, int]
-) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0
+@numba.njit(cache=True)
+def _taut(u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Which of the points (n,), sorted by u, a tape above them touches, first and last included."""
+    kept = np.empty(len(u), np.int64)
+    size = 0
+    for here in range(len(u)):
+        while size >= 2 and _turn(u, v, kept[size - 2], kept[size - 1], here) >= 0.0:
+            size -= 1
+        kept[size] = here
+        size += 1
+    return kept[:size]

@@ -34,6 +34,7 @@ from workers.scape.paper import fit_like_the_paper
 from workers.scape.sampling import Sampling
 from workers.scape.surface import fit_surface
 from workers.scape.verdict import (
+    POSSIBLE_HEIGHTS_M,
     PartReport,
     Verdict,
     judge,
@@ -223,7 +224,7 @@ def _refuse_absurd(cloud: PointCloud) -> None:
     if len(cloud) < _LEAST_POINTS:
         raise InputError(f"the cloud has {len(cloud)} points; a body needs {_LEAST_POINTS}")
     height_m = float(np.ptp(cloud.points[:, 2]))
-    if not 1.0 < height_m < 2.6:
+    if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(
             f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected"
         )

@@ -34,13 +34,13 @@ def posed(
     state: BodyState,
     arm_deg: tuple[float, float],
     swing_deg: tuple[float, float],
-    heading_rad: float,
+    heading_deg: float,
 ) -> BodyState:
     """A state with arms (left, right) so many degrees from the trunk and so many behind it, turned
     about the vertical."""
     names = list(model.part_names)
     twists = np.zeros((model.part_count, 3))
-    twists[0, 2] = heading_rad
+    twists[0, 2] = np.radians(heading_deg)
     for side, sign, angle, swing in zip(
         ("left", "right"), (1.0, -1.0), arm_deg, swing_deg, strict=True
     ):
@@ -79,7 +79,7 @@ def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list
     arms, _ = scout.arms(state, ())
 
     def scored(tried: list[_Try]) -> tuple[Array, list[BodyState]]:
-        states = [posed(model, state, *one[:2], np.radians(one[2])) for one in tried]
+        states = [posed(model, state, *one) for one in tried]
         bodies, states = _placed(model, scout, arms, states, center)
         return _costs(bodies, points), states
 

@@ -271,13 +271,7 @@ def conjugate_gradients(first, columns, values, right, tolerance, most):  # type
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
-def add_places(  # type: ignore[no-untyped-def]  # pragma: no cover
-    blocks,
-    rotations,
-    beta,
-    twists,
-    positions,
-):
+def add_places(blocks, rotations, beta, twists, positions):  # type: ignore[no-untyped-def]  # pragma: no cover
     """What `add_blocks` adds to the positions alone."""
     starts, parts, mean, shape, twist_starts, twist_parts, twist_joints, twist_blocks = blocks
     for v in range(len(starts)):
