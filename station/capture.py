@@ -99,8 +99,11 @@ class CaptureProcess:
             self._failed(self._driver, error)
             return
         if frame is not None:
+            first = self._state != "streaming"
             self._state, self._detail, self._failures = "streaming", "", 0
             self._publish(frame)
+            if first:
+                self._tell_health(now=True)
 
     def _publish(self, frame: DepthFrame) -> None:
         info, clock = self._info, self._clock

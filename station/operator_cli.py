@@ -53,18 +53,21 @@ def start(config_path: Path | None, timeout_s: float) -> None:
     config = load_config(find_config(config_path))
     _command(config, Request("start"))
     deadline_s = time.monotonic() + timeout_s
+    troubles: dict[str, str] = {}
     while True:
         sync = _command(config, Request("status"))["sync"]
         silent = sync.get("silent", [camera.name for camera in config.cameras])
         if not silent:
             break
+        for name in silent:
+            detail = sync.get("cameras", {}).get(name, {}).get("detail")
+            # Between two tries a camera has nothing to say; what it said last still holds.
+            if detail and troubles.get(name) != detail:
+                troubles[name] = detail
+                click.echo(f"  camera {name}: {detail}; trying again", err=True)
         if time.monotonic() > deadline_s:
-            known = sync.get("cameras", {})
             raise BoothError(
-                "; ".join(
-                    f"camera {name}: {known.get(name, {}).get('detail') or 'no frames'}"
-                    for name in silent
-                )
+                "; ".join(f"camera {name}: {troubles.get(name, 'no frames')}" for name in silent)
             )
         time.sleep(_POLL_S)
     click.echo(f"{len(config.cameras)} cameras streaming")

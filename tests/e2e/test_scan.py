@@ -105,6 +105,8 @@ def test_a_lost_recording_names_the_camera(make_station: Callable[..., object]) 
     assert started.returncode == 1
     assert "camera front-upper" in started.stderr
     assert "nowhere" in started.stderr
+    # Told as soon as it is known, not when the time is up.
+    assert "trying again" in started.stderr.splitlines()[0]
     refused = station.command("scan")
     assert refused.returncode == 1
     assert "front-upper" in refused.stderr
