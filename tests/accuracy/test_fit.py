@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, preprocess
+from station.geometry import so3_exp
 from workers.scape.deformation import vertex_normals
 from workers.scape.fit import FitResult, fit_body
 from workers.scape.intersections import self_intersections, turned_over
@@ -80,6 +82,19 @@ def test_the_mesh_is_the_same_whatever_the_thread_count(bundle: Path, tmp_path: 
         )
         meshes.append((out / "mesh.ply").read_bytes())
     assert meshes[0] == meshes[1]
+
+
+@pytest.mark.parametrize("turn_deg", [180.0, -80.0])
+def test_a_person_may_face_any_way(model: BodyModel, bundle: Path, turn_deg: float) -> None:
+    """Scanners have fronts of their own, and people misunderstand where to look."""
+    cloud = preprocess(read_bundle(bundle)).cloud
+    turn = so3_exp([0.0, 0.0, np.radians(turn_deg)])
+    turned = replace(cloud, points=cloud.points @ turn.T, normals=cloud.normals @ turn.T)
+    fit = fit_body(model, Preprocessed(turned, (), ()))
+    truth = np.load(BODIES / "ben.npz")["vertices"] @ turn.T
+    away = _distance_to(fit.vertices, model.faces, truth)
+    assert np.sqrt(np.mean(away**2)) < 0.004
+    assert fit.verdict.status == "ok"
 
 
 def test_the_paper_method_gives_a_body_too(model: BodyModel, bundle: Path) -> None:

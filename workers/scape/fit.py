@@ -17,7 +17,7 @@ from station.errors import InputError
 from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
-from workers.scape.initial import starting_states
+from workers.scape.initial import facing_deg, starting_states
 from workers.scape.intersections import untangled
 from workers.scape.joint import (
     COARSE,
@@ -51,6 +51,8 @@ _LEAST_POINTS = 1500
 _TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
+_FEWER = 5
+"""Of the points: enough to tell where the toes are."""
 _MOST_STARTS = 4
 _EXPLAINED = 0.008
 
@@ -116,7 +118,8 @@ def _fit(
     sampling = sampling_of(model)
     scout = sampling.body.first(_SCOUT_SAMPLES)
     target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
-    starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
+    coarse = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
+    starts = starting_states(model, scout, coarse, facing_deg(target.tree.points[::_FEWER]))
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()

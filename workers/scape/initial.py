@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from workers.scape.kernels import trimmed_costs
 from workers.scape.model import BodyModel, BodyState
@@ -17,6 +18,10 @@ Array = NDArray[np.float64]
 _NEUTRAL_ARM_DEG = 43.0
 _ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+_FACING_DEG = 36.0
+"""Who is turned by less faces the booth's front."""
+_TOES_M = 0.01
+"""How far feet reach ahead of their ankles, at the least."""
 _SWINGS_DEG = (-25.0, 0.0, 25.0)
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
 _CLOUD_TRIM_M = 0.48
@@ -65,13 +70,15 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
     return beta * min(1.0, 3.5 / max(norm, 1e-9))
 
 
-def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list[BodyState]:
+def starting_states(
+    model: BodyModel, scout: SampledBody, points: Array, about_deg: float = 0.0
+) -> list[BodyState]:
     """States to start from, best first, judged on a coarse sample of the cloud (n, 3).
 
-    First both arms at one angle and all headings, then each arm alone at the best heading, then
-    each arm swung forward and back.
+    First both arms at one angle and all headings about one, then each arm alone at the
+    best heading, then each arm swung forward and back.
     """
-    stature = float(np.quantile(points[:, 2], 0.9995))
+    stature = _stature_m(points)
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
     trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
     center = np.median(trunk if len(trunk) > 50 else points, axis=0)
@@ -85,7 +92,7 @@ def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list
 
     straight = (0.0, 0.0)
     together = [
-        ((arm, arm), straight, heading) for arm, heading in product(_ARMS_DEG, _HEADINGS_DEG)
+        ((arm, arm), straight, about_deg + turn) for arm, turn in product(_ARMS_DEG, _HEADINGS_DEG)
     ]
     heading = together[int(np.argmin(scored(together)[0]))][2]
     apart = [(arms_deg, straight, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)]
@@ -95,6 +102,31 @@ def starting_states(model: BodyModel, scout: SampledBody, points: Array) -> list
     more_costs, more_states = scored([one for one in swung if any(one[1])])
     costs, states = np.concatenate([costs, more_costs]), states + more_states
     return [states[index] for index in np.argsort(costs, kind="stable")]
+
+
+def facing_deg(points: Array) -> float:
+    """Roughly where a person looks, degrees about z from -y, of a cloud (n, 3) on the floor.
+
+    Shoulders are broader than deep, and toes point ahead.
+    """
+    height = points[:, 2] / _stature_m(points)
+    shoulders = points[(height > 0.70) & (height < 0.84), :2]
+    feet, ankles = points[height < 0.04, :2], points[(height > 0.06) & (height < 0.12), :2]
+    if min(len(shoulders), len(feet), len(ankles)) < 3:
+        return 0.0
+    depth = np.linalg.eigh(np.cov(shoulders.T))[1][:, 0]
+    own = cKDTree(ankles).query(feet)[1]
+    ahead = float(depth @ (feet - ankles[own]).mean(axis=0))
+    forward = depth if ahead > 0.0 else -depth
+    # Feet that do not tell leave the booth's front.
+    if abs(ahead) < _TOES_M and forward[1] > 0.0:
+        forward = -forward
+    facing = float(np.degrees(np.arctan2(forward[0], -forward[1])))
+    return 0.0 if abs(facing) < _FACING_DEG else facing
+
+
+def _stature_m(points: Array) -> float:
+    return float(np.quantile(points[:, 2], 0.9995))
 
 
 def _placed(

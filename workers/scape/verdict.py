@@ -30,7 +30,7 @@ _STATURE_M = (1.30, 2.25)
 _IMPLAUSIBLE_BETA = 6.0
 _TRUNK = ("pelvis", "abdomen", "chest")
 _SIDES = {"front": -1.0, "back": 1.0}
-"""Of a person on the mark, who faces -y."""
+"""The template faces -y."""
 _FACING = 0.7
 _HAND = ("hand", "thumb", "fingers")
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
@@ -89,7 +89,7 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     A part that is seen from one side alone may still be seen by half.
     """
     areas = vertex_areas(vertices, model.faces)
-    toward = vertex_normals(vertices, model.faces)[:, 1]
+    toward = vertex_normals(model.mean, model.faces)[:, 1]
     trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
     shares = {}
     for side, sign in _SIDES.items():
