@@ -1,5 +1,6 @@
 """How high the head reaches, by where it ends in images."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from station.depth import CameraView, PointCloud
 from station.depth.points import camera_points
-from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, default_rig
+from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, default_rig, rod
 from station.geometry import rigid, so3_exp, transform
 from workers.scape.cameras import CameraCorrections
 from workers.scape.crown import Reach, reach
@@ -39,12 +40,14 @@ def _view(
     *,
     walls: bool = True,
     bald: bool = True,
+    beside: Sequence[Mesh] = (),
 ) -> CameraView:
     """What a sensor without noise reads of a body, up to 71 degrees of incidence."""
     dark = np.zeros(len(model.faces), bool)
     if not bald:
         dark = body[model.faces][:, :, 2].mean(axis=1) > body[:, 2].max() - 0.045
-    scene = VirtualScene([*(booth_walls() if walls else ()), Mesh(body, model.faces, dark)])
+    around = booth_walls() if walls else ()
+    scene = VirtualScene([*around, *beside, Mesh(body, model.faces, dark)])
     seen = scene.view(UPPER, pose)
     steep = (seen.incidence_rad > np.radians(71.0)) & (seen.depth_m < 2.0)
     depth = np.where(seen.lit & seen.reflects & ~steep, seen.depth_m, 0.0).astype(np.float32)
@@ -94,6 +97,13 @@ def test_a_camera_on_its_side_has_the_projectors_shadow_over_the_head(
     model: BodyModel, body: np.ndarray
 ) -> None:
     assert not len(_reach(model, _view(model, body, ROLLED), body).vertex)
+
+
+def test_a_stick_above_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:
+    x, y, z = body[np.argmax(body[:, 2])]
+    stick = rod((x - 0.3, y, z + 0.03), (x + 0.3, y, z + 0.03), 0.004)
+    found = _reach(model, _view(model, body, beside=[stick]), body)
+    assert np.mean(found.distance_m) == pytest.approx(0.0, abs=0.0015)
 
 
 def test_a_head_beyond_the_image_is_no_crown(model: BodyModel, body: np.ndarray) -> None:

@@ -169,14 +169,14 @@ def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Ind
 def _edge(depth_m: Image, column: Index, row: Index, out: int, near_m: Array) -> Index:
     """(n,): the row of the booth's first reading beyond the head's last one; -1 where the gap
     between them is wide or holds something else, or either is missing."""
-    # From outside to inside.
-    rows = row[:, None] + out * np.arange(_REACH_PX, -_REACH_PX - 1, -1)
+    # From inside to outside.
+    rows = row[:, None] + out * np.arange(-_REACH_PX, _REACH_PX + 1)
     reading = depth_m[rows, column[:, None]]
     farther = reading - near_m[:, None]
-    inner = np.argmax((farther > -_NEARER_M) & (farther < _BEHIND_M), axis=1)
-    read = np.where(reading > 0.0, np.arange(rows.shape[1]), -1)
     each = np.arange(len(rows))
-    outer = np.maximum.accumulate(read, axis=1)[each, inner - 1]
-    found = (inner > 0) & (outer >= 0) & (inner - outer <= _WIDEST_PX)
-    found &= farther[each, outer] > _BEHIND_M
+    outer = np.argmax(farther > _BEHIND_M, axis=1)
+    read = np.where(reading > 0.0, np.arange(rows.shape[1]), -1)
+    inner = np.maximum.accumulate(read, axis=1)[each, outer - 1]
+    found = (outer > 0) & (inner >= 0) & (outer - inner <= _WIDEST_PX)
+    found &= farther[each, inner] > -_NEARER_M
     return np.where(found, rows[each, outer], -1)
