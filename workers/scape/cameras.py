@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.depth import CameraView, PointCloud
-from station.geometry import so3_exp
+from station.geometry import rigid, so3_exp
 
 Array = NDArray[np.float64]
 Index = NDArray[np.integer]
@@ -76,6 +76,15 @@ class CameraCorrections:
             mine = camera == index
             eye = self.eyes[index]
             found[mine] = (points[mine] - eye) @ turn.T + (eye + self.xi[index, 3:])
+        return found
+
+    def poses(self, views: Sequence[CameraView]) -> list[Array]:
+        """world_from_camera (4, 4) of the cloud's views where the corrections have them."""
+        found = []
+        for view, eye, xi in zip(views, self.eyes, self.xi, strict=True):
+            turn = so3_exp(xi[None, :3])[0]
+            pose = view.calibration.world_from_camera
+            found.append(rigid(turn @ pose[:3, :3], eye + xi[3:]))
         return found
 
     def shifts_m(self, cloud: PointCloud) -> dict[str, float]:

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from station.depth import CameraView, PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.cameras import CameraCorrections
+from workers.scape.crown import reach
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import facing_deg, starting_states
@@ -139,7 +140,8 @@ def _fit(
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
-        surface = fit_surface(model, joint.vertices, cloud)
+        crown = partial(reach, model, scan.views, cameras.poses(scan.views))
+        surface = fit_surface(model, joint.vertices, cloud, crown)
         overlapping = surface.vertices
         free = untangled(model, overlapping, joint.vertices)
         surface = replace(surface, vertices=free)

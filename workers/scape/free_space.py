@@ -31,7 +31,6 @@ _DEEPEST_PX = 40.0
 @dataclass(frozen=True, slots=True)
 class _View:
     camera: CameraView
-    camera_from_world: Array
     inside_px: Image
     """(h, w): distance to the nearest pixel that is not background; 0 elsewhere."""
     slope: tuple[Image, Image]
@@ -58,12 +57,16 @@ class FreeSpace:
     @classmethod
     def build(cls, views: Sequence[CameraView]) -> FreeSpace:
         with ThreadPoolExecutor(max_workers=2) as pool:
-            found = pool.map(_view, (view for view in views if view.background.any()))
+            found = pool.map(_view, (view for view in views))
             return cls(tuple(found))
 
-    def intrusions(self, vertices: Array) -> Intrusions:
-        """The vertices (P, 3) among which a camera saw the booth behind, once a camera."""
-        found = [_intrusions(view, vertices) for view in self.views]
+    def intrusions(self, poses: Sequence[Array], vertices: Array) -> Intrusions:
+        """The vertices (P, 3) among which a camera saw the booth behind, once a camera; world from
+        camera (4, 4) as the cameras' corrections have it.
+        """
+        found = [
+            _intrusions(view, pose, vertices) for view, pose in zip(self.views, poses, strict=True)
+        ]
         if not found:
             return Intrusions(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0))
         return Intrusions(
@@ -79,15 +82,14 @@ def _view(view: CameraView) -> _View:
     slope_v = cv2.Sobel(inside, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     return _View(
         view,
-        invert(view.calibration.world_from_camera),
         inside.astype(np.float32, copy=False),
         (slope_u.astype(np.float32, copy=False), slope_v.astype(np.float32, copy=False)),
     )
 
 
-def _intrusions(view: _View, vertices: Array) -> Intrusions:
+def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
     camera = view.camera.calibration
-    local = transform(view.camera_from_world, vertices)
+    local = transform(invert(pose), vertices)
     pixels = np.rint(np.nan_to_num(project(camera, local), nan=-1.0)).astype(np.int64)
     height, width = view.inside_px.shape
     inside = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
@@ -99,7 +101,7 @@ def _intrusions(view: _View, vertices: Array) -> Intrusions:
     vertex, u, v, deep = vertex[wrong], u[wrong], v[wrong], deep[wrong]
     slope = np.stack([view.slope[0][v, u], view.slope[1][v, u]], axis=1).astype(np.float64)
     slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
-    axes = camera.world_from_camera[:3, :2]
+    axes = pose[:3, :2]
     return Intrusions(
         vertex,
         slope @ axes.T,

@@ -20,10 +20,11 @@ from station.depth import CameraView, PointCloud
 from station.geometry import so3_exp
 from workers.scape.cameras import CameraCorrections
 from workers.scape.correspondence import Followers, OrientedTree
+from workers.scape.crown import reach
 from workers.scape.free_space import FreeSpace
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
-from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
+from workers.scape.rows import CameraTerms, Rows, Skin, crown_rows, floor_rows, outline_rows
 from workers.scape.sampled import twist_chain
 from workers.scape.sampling import COARSE_SAMPLES, FINE_SAMPLES, Sampling
 
@@ -86,6 +87,8 @@ class Target:
     coarse: OrientedTree
     """Of these alone."""
     free_space: FreeSpace
+    views: tuple[CameraView, ...]
+    """In the order of their corrections."""
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
 
@@ -101,6 +104,7 @@ class Target:
             pulled,
             OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
+            tuple(views),
             cloud.camera[used].astype(np.intp),
         )
 
@@ -185,7 +189,7 @@ def _data_terms(
     skin: Skin,
     stage: Stage,
 ) -> _DataTerms:
-    """Correspondences, floor and outlines, summed up at the samples."""
+    """Correspondences, floor, outlines and crown, summed up at the samples."""
     cloud = target.tree
     if stage.coarse:
         pulled = target.pulled[::_COARSELY_PULLED]
@@ -208,7 +212,9 @@ def _data_terms(
     rows = [pairs, floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))]
     camera_terms = None
     if not stage.coarse:
-        rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
+        poses = cameras.poses(target.views)
+        rows.append(outline_rows(model, target.free_space, poses, skin, stage.row_share))
+        rows.append(crown_rows(reach(model, target.views, poses, skin.positions)))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.scape.crown import Reach
 from workers.scape.free_space import FreeSpace
 from workers.scape.model import BodyModel
 
@@ -136,9 +138,15 @@ def floor_rows(model: BodyModel, skin: Skin, reach_m: float) -> Rows:
     )
 
 
-def outline_rows(model: BodyModel, free_space: FreeSpace, skin: Skin, row_share: float) -> Rows:
-    """Places go back from where a camera saw the booth behind them."""
-    found = free_space.intrusions(skin.positions[::_OUTLINE_EVERY])
+def outline_rows(
+    model: BodyModel,
+    free_space: FreeSpace,
+    poses: Sequence[Array],
+    skin: Skin,
+    row_share: float,
+) -> Rows:
+    """Places go back from where a camera at its pose (4, 4) saw the booth behind them."""
+    found = free_space.intrusions(poses, skin.positions[::_OUTLINE_EVERY])
     place = _OUTLINE_EVERY * found.vertex
     searched = [i for i, name in enumerate(model.part_names) if name.startswith(_SEARCHED)]
     kept = ~np.isin(skin.part[place], searched)
@@ -149,3 +157,8 @@ def outline_rows(model: BodyModel, free_space: FreeSpace, skin: Skin, row_share:
         -found.depth_m[kept],
         _OUTLINE_EVERY * row_share / _OUTLINE_SIGMA_M**2 * skin.share[place],
     )
+
+
+def crown_rows(reach: Reach) -> Rows:
+    """The head ends where the cameras see it end; a camera's word counts in full, once."""
+    return Rows(reach.vertex, reach.direction, reach.distance_m, reach.information)

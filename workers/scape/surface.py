@@ -10,6 +10,7 @@ with a narrower gate and less stiffness.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from station.depth import PointCloud
 from workers.scape.correspondence import Followers
+from workers.scape.crown import Reach
 from workers.scape.deformation import area_vectors, vertex_normals
 from workers.scape.kernels import conjugate_gradients
 from workers.scape.model import BodyModel
@@ -56,8 +58,14 @@ class SurfaceFit:
     """(P,): mean signed distance of its points after the fit; NaN where there are none."""
 
 
-def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
-    """Lay the model's surface (P, 3) on the cloud's points."""
+def fit_surface(
+    model: BodyModel, vertices: Array, cloud: PointCloud, crown: Callable[[Array], Reach]
+) -> SurfaceFit:
+    """Lay the model's surface (P, 3) on the cloud's points.
+
+    Where a surface's crown is seen to end besides, a function of its vertices says: the field would
+    carry there, where no point is, what the points around it ask for.
+    """
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
     followers = Followers(model.neighbours, cloud.points[every], cloud.normals[every], dense=True)
     noise = cloud.sigma_m[every]
@@ -67,6 +75,7 @@ def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> Surface
     for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
         normals = vertex_normals(current, model.faces)
         residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
+        residual, weight = _with_crown(residual, weight, normals, crown(current))
         bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
         matrix = (sp.diags(weight) + bending * (laplacian + _FADE * identity)).tocsr()
         step = conjugate_gradients(
@@ -120,6 +129,18 @@ def _gathered(
     weight: Array = np.bincount(vertex, information, count).astype(np.float64)
     total: Array = np.bincount(vertex, information * distance, count).astype(np.float64)
     return total / np.maximum(weight, 1e-12), weight
+
+
+def _with_crown(
+    residual: Array, weight: Array, normals: Array, crown: Reach
+) -> tuple[Array, Array]:
+    """Distances along the normals (P,) and their information, and what the outlines say of them."""
+    count = len(weight)
+    along = np.einsum("ni,ni->n", crown.direction, normals[crown.vertex])
+    strength = crown.information * along
+    total = weight + np.bincount(crown.vertex, strength * along, count)
+    pull = weight * residual + np.bincount(crown.vertex, strength * crown.distance_m, count)
+    return pull / np.maximum(total, 1e-12), total
 
 
 def _stood_on_floor(model: BodyModel, vertices: Array) -> Array:

@@ -1,0 +1,158 @@
+"""How high the head reaches, by where it ends in images."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from station.depth import CameraView, PointCloud
+from station.depth.points import camera_points
+from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, default_rig, rod
+from station.geometry import rigid, so3_exp, transform
+from workers.scape.cameras import CameraCorrections
+from workers.scape.crown import Reach, reach
+from workers.scape.deformation import vertex_normals
+from workers.scape.model import BodyModel, load_model
+from workers.scape.surface import fit_surface
+
+UPPER = default_rig().cameras["front-upper"]
+POSE = UPPER.world_from_camera
+ROLLED = POSE @ rigid(so3_exp([0.0, 0.0, 0.5 * np.pi]), np.zeros(3))
+TURNED = POSE @ rigid(so3_exp([0.0, 0.0, np.pi]), np.zeros(3))
+HIGHER = np.array([0.0, 0.0, 0.006])
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def body(model: BodyModel) -> np.ndarray:
+    return model.mean - (0.0, 0.0, model.mean[:, 2].min())
+
+
+def _view(
+    model: BodyModel,
+    body: np.ndarray,
+    pose: np.ndarray = POSE,
+    *,
+    walls: bool = True,
+    bald: bool = True,
+    beside: Sequence[Mesh] = (),
+) -> CameraView:
+    """What a sensor without noise reads of a body, up to 71 degrees of incidence."""
+    dark = np.zeros(len(model.faces), bool)
+    if not bald:
+        dark = body[model.faces][:, :, 2].mean(axis=1) > body[:, 2].max() - 0.045
+    around = booth_walls() if walls else ()
+    scene = VirtualScene([*around, *beside, Mesh(body, model.faces, dark)])
+    seen = scene.view(UPPER, pose)
+    steep = (seen.incidence_rad > np.radians(71.0)) & (seen.depth_m < 2.0)
+    depth = np.where(seen.lit & seen.reflects & ~steep, seen.depth_m, 0.0).astype(np.float32)
+    nothing = np.zeros(depth.shape, bool)
+    return CameraView(
+        "front-upper", replace(UPPER, world_from_camera=pose), depth, nothing, nothing
+    )
+
+
+def _reach(model: BodyModel, view: CameraView, body: np.ndarray) -> Reach:
+    return reach(model, [view], [view.calibration.world_from_camera], body)
+
+
+@pytest.mark.parametrize("pose", [POSE, TURNED], ids=["upright", "upside down"])
+def test_a_head_ends_where_the_booth_begins(
+    model: BodyModel, body: np.ndarray, pose: np.ndarray
+) -> None:
+    view = _view(model, body, pose)
+    for shift in (-HIGHER, 0.0 * HIGHER, HIGHER):
+        found = _reach(model, view, body - shift)
+        # Of the pixel, 3 mm wide, half is known.
+        assert np.mean(found.distance_m) == pytest.approx(shift[2], abs=0.0015)
+        assert (found.direction[:, 2] > 0.95).all()
+        assert (body[found.vertex, 2] > body[:, 2].max() - 0.02).all()
+
+
+def test_a_camera_says_it_once_however_many_columns_it_has(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    view = _view(model, body)
+    once = _reach(model, view, body)
+    twice = reach(model, [view, view], [POSE, POSE], body)
+    assert len(once.vertex) > 6
+    assert once.information.sum() == pytest.approx(1.0 / 0.0015**2)
+    assert twice.information.sum() == pytest.approx(2.0 * once.information.sum())
+
+
+def test_where_no_booth_is_seen_behind_nothing_is_said(model: BodyModel, body: np.ndarray) -> None:
+    assert not len(_reach(model, _view(model, body, walls=False), body).vertex)
+
+
+def test_hair_that_gives_no_reading_is_no_crown(model: BodyModel, body: np.ndarray) -> None:
+    assert not len(_reach(model, _view(model, body, bald=False), body).vertex)
+
+
+def test_a_camera_on_its_side_has_the_projectors_shadow_over_the_head(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    assert not len(_reach(model, _view(model, body, ROLLED), body).vertex)
+
+
+def test_a_stick_above_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:
+    x, y, z = body[np.argmax(body[:, 2])]
+    stick = rod((x - 0.3, y, z + 0.03), (x + 0.3, y, z + 0.03), 0.004)
+    found = _reach(model, _view(model, body, beside=[stick]), body)
+    assert np.mean(found.distance_m) == pytest.approx(0.0, abs=0.0015)
+
+
+def test_a_head_beyond_the_image_is_no_crown(model: BodyModel, body: np.ndarray) -> None:
+    taller = body * (2.3 / body[:, 2].max())
+    assert not len(_reach(model, _view(model, taller), taller).vertex)
+
+
+def test_a_bare_cloud_has_no_outline(model: BodyModel, body: np.ndarray) -> None:
+    assert not len(reach(model, [], [], body).vertex)
+
+
+def test_a_corrected_camera_stands_where_its_points_are_moved_to(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    view = _view(model, body)
+    local = camera_points(UPPER, view.depth_m)[view.depth_m > 0].astype(np.float64)
+    points = transform(POSE, local)
+    camera = np.zeros(len(points), np.int16)
+    cloud = PointCloud(points, points, np.ones(len(points)), camera, ("front-upper",))
+    corrections = CameraCorrections.build(cloud, [view]).stepped(
+        np.array([[0.003, -0.002, 0.001, 0.004, 0.001, -0.002]])
+    )
+    pose = corrections.poses([view])[0]
+    assert np.allclose(transform(pose, local), corrections.moved(points, camera), atol=1e-9)
+
+
+def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    """Points up to 2 cm below the top of a head that is 6 mm higher from the ears up."""
+    top = body[:, 2].max()
+    share = np.clip((body[:, 2] - (top - 0.10)) / 0.10, 0.0, 1.0)
+    higher = body + share[:, None] * HIGHER
+    normals = vertex_normals(higher, model.faces)
+    seen = higher[:, 2] < top - 0.02
+    count = int(seen.sum())
+    cloud = PointCloud(
+        higher[seen],
+        normals[seen],
+        np.full(count, 1e-3),
+        np.zeros(count, np.int16),
+        ("front-upper",),
+    )
+    view = _view(model, higher)
+
+    def missing(views: list[CameraView]) -> float:
+        poses = [view.calibration.world_from_camera for view in views]
+        fitted = fit_surface(model, body, cloud, lambda found: reach(model, views, poses, found))
+        return float(higher[:, 2].max() - fitted.vertices[:, 2].max())
+
+    assert missing([]) > 0.002
+    assert abs(missing([view, view])) < 0.0015

@@ -1,0 +1,182 @@
+"""How high the head reaches: its highest centimetres are seen at a slant and give no reading, but
+where they end the booth is seen behind them.
+
+In a column of an image the head's last reading, a gap and the booth's first reading follow each
+other; the head ends half a pixel before the latter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.depth import CameraView
+from station.depth.points import Image, project
+from station.geometry import invert, transform
+from workers.scape.model import BodyModel
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_CROWN_M = 0.05
+"""The head ends within so much of its highest point, unless a camera looks down on it."""
+_CAP_M = 0.07
+"""What is drawn: deep enough that its lower rim is not taken for an outline."""
+_LEVEL = np.tan(np.radians(10.0))
+"""Slope of an outline along the rows: the projector stands beside the camera, its shadow falls
+along them. On a skull's radius of 15 cm it hides less than 0.7 px of what lies beyond such an
+outline, however wide it is."""
+_SLOPE_PX = 3
+_REACH_PX = 16
+_WIDEST_PX = 12
+"""A wider gap is no slant but hair that gives no reading, and a stature is measured without."""
+_BEHIND_M = 0.08
+_NEARER_M = 0.12
+"""The last reading of a flat skull is so much nearer than its outline."""
+_LEAST_COLUMNS = 6
+_SIGMA_M = 0.0015
+"""Of one camera's word, however many columns it has: half a pixel, or 0.05 degrees of its pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Where n columns of images see the head end."""
+
+    vertex: Index
+    """(n,): at the body's outline."""
+    direction: Array
+    """(n, 3): unit, out of the outline."""
+    distance_m: Array
+    """(n,): from the outline to where the head ends, negative inwards."""
+    information: Array
+    """(n,): one over the variance."""
+
+
+_UNSEEN = Reach(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Cap:
+    """The head's highest part."""
+
+    vertex: Index
+    """(k,): of the body."""
+    points: Array
+    """(k, 3)."""
+    edges: Index
+    """(e, 2): between them."""
+
+
+def reach(
+    model: BodyModel, views: Sequence[CameraView], poses: Sequence[Array], vertices: Array
+) -> Reach:
+    """How far from the outline of a body (P, 3) cameras at poses (4, 4) see its head end."""
+    cap = _cap(model, vertices)
+    found = [_UNSEEN, *(_seen(view, pose, cap) for view, pose in zip(views, poses, strict=True))]
+    return Reach(
+        np.concatenate([one.vertex for one in found]),
+        np.concatenate([one.direction for one in found]),
+        np.concatenate([one.distance_m for one in found]),
+        np.concatenate([one.information for one in found]),
+    )
+
+
+def _cap(model: BodyModel, vertices: Array) -> _Cap:
+    head, edges = _head(model)
+    height = vertices[head, 2]
+    high = height > height.max() - _CAP_M
+    number = np.cumsum(high) - 1
+    return _Cap(
+        head[high], vertices[head[high]], number[edges[high[edges[:, 0]] & high[edges[:, 1]]]]
+    )
+
+
+@lru_cache(maxsize=2)
+def _head(model: BodyModel) -> tuple[Index, Index]:
+    """The head's vertices, and the edges (e, 2) between them."""
+    head = model.part_of_vertex == model.part_names.index("head")
+    faces = model.faces[head[model.faces].all(axis=1)]
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    used, ends = np.unique(edges, return_inverse=True)
+    return used.astype(np.intp), ends.reshape(-1, 2).astype(np.intp)
+
+
+def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
+    """What one camera says."""
+    K, (height, width) = view.calibration.K, view.depth_m.shape
+    local = transform(invert(pose), cap.points)
+    places = np.nan_to_num(project(view.calibration, local), nan=-1.0)
+    inside = (places[:, 1] > _REACH_PX) & (places[:, 1] < height - _REACH_PX - 1)
+    # An outline that leaves the image says nothing, nor does a head that is not in it.
+    if not inside.all():
+        return _UNSEEN
+    out = 1 if pose[2, 1] > 0.0 else -1
+    column, row, place = _outline(places * (1, out), cap.edges, width)
+    row *= out
+    edge = _edge(view.depth_m, column, np.rint(row).astype(np.intp), out, local[place, 2])
+    used = (edge >= 0) & (cap.points[place, 2] > cap.points[:, 2].max() - _CROWN_M)
+    count = int(used.sum())
+    if count < _LEAST_COLUMNS:
+        return _UNSEEN
+    row, place, edge = row[used], place[used], edge[used]
+    slope = (row - K[1, 2]) / K[1, 1]
+    length = np.hypot(1.0, slope)
+    # Out of the plane of the ray and the row.
+    direction = out * (pose[:3, 1] - slope[:, None] * pose[:3, 2]) / length[:, None]
+    higher_px = out * (edge - row) - 0.5
+    return Reach(
+        cap.vertex[place],
+        direction,
+        higher_px * local[place, 2] / (K[1, 1] * length),
+        np.full(count, 1.0 / (count * _SIGMA_M**2)),
+    )
+
+
+def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Index]:
+    """Columns in which a drawing ends level; how far along v; the nearer end of the line there.
+
+    Args:
+        places: (k, 2) pixels.
+        edges: (e, 2): lines between them.
+        width: number of columns.
+    """
+    start, stop = edges.T
+    swapped = places[start, 0] > places[stop, 0]
+    start, stop = np.where(swapped, stop, start), np.where(swapped, start, stop)
+    first = np.ceil(np.maximum(places[start, 0], 0.0)).astype(np.intp)
+    last = np.floor(np.minimum(places[stop, 0], width - 1.0)).astype(np.intp)
+    count = np.maximum(last - first + 1, 0)
+    line = np.repeat(np.arange(len(edges)), count)
+    column = np.arange(len(line)) + np.repeat(first - np.cumsum(count) + count, count)
+    a, b = places[start[line]], places[stop[line]]
+    share = (column - a[:, 0]) / np.maximum(b[:, 0] - a[:, 0], 1e-9)
+    height = a[:, 1] + share * (b[:, 1] - a[:, 1])
+    row = np.full(width + 2 * _SLOPE_PX, np.nan)
+    inner = row[_SLOPE_PX:-_SLOPE_PX]
+    np.fmax.at(inner, column, height)
+    topmost = height == inner[column]
+    end = np.zeros(width, np.intp)
+    end[column[topmost]] = np.where(share < 0.5, start[line], stop[line])[topmost]
+    slope = (row[2 * _SLOPE_PX :] - row[: -2 * _SLOPE_PX]) / (2 * _SLOPE_PX)
+    level = np.flatnonzero(np.abs(slope) < _LEVEL)
+    return level, inner[level], end[level]
+
+
+def _edge(depth_m: Image, column: Index, row: Index, out: int, near_m: Array) -> Index:
+    """(n,): the row of the booth's first reading beyond the head's last one; -1 where the gap
+    between them is wide or holds something else, or either is missing."""
+    # From inside to outside.
+    rows = row[:, None] + out * np.arange(-_REACH_PX, _REACH_PX + 1)
+    reading = depth_m[rows, column[:, None]]
+    farther = reading - near_m[:, None]
+    each = np.arange(len(rows))
+    outer = np.argmax(farther > _BEHIND_M, axis=1)
+    read = np.where(reading > 0.0, np.arange(rows.shape[1]), -1)
+    inner = np.maximum.accumulate(read, axis=1)[each, outer - 1]
+    found = (outer > 0) & (inner >= 0) & (outer - inner <= _WIDEST_PX)
+    found &= farther[each, inner] > -_NEARER_M
+    return np.where(found, rows[each, outer], -1)
