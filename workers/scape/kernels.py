@@ -112,9 +112,11 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
     """
     tries, size, count = tried.shape
     result = np.empty(tries)
-    square = np.empty(count, np.float32)
+    square, back = np.empty((2, count), np.float32)
+    # Squares compare as the whole numbers that their bits are, and those have a vector minimum.
+    square_bits, back_bits = square.view(np.int32), back.view(np.int32)
     for h in range(tries):
-        back = np.full(count, np.float32(1e9))
+        back[:] = np.float32(np.inf)
         total = 0.0
         for p in range(len(cloud)):
             # Three coordinates at a time: one pass over memory, in vector registers.
@@ -125,11 +127,11 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
                     x, y, z = row0[s] - here0, row1[s] - here1, row2[s] - here2
                     before = square[s] if k > 0 else np.float32(0.0)
                     square[s] = before + x * x + y * y + z * z
-            least = np.float32(1e9)
+            least = square_bits[0]
             for s in range(count):
-                least = min(least, square[s])
-                back[s] = min(back[s], square[s])
-            total += min(np.sqrt(least), cloud_cut)
+                least = min(least, square_bits[s])
+                back_bits[s] = min(back_bits[s], square_bits[s])
+            total += min(np.sqrt(np.int32(least).view(np.float32)), cloud_cut)
         other = 0.0
         for s in range(count):
             other += min(np.sqrt(back[s]), tried_cut)
@@ -297,3 +299,16 @@ def _place(position, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: 
     position[0] += turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
     position[1] += turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
     position[2] += turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+
+
+@numba.njit(cache=True, nogil=True)
+def moved(points, group, turns, shifts):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(n, 3): points of groups (n,), each turned by its group's matrix (g, 3, 3), then shifted by
+    its (g, 3)."""
+    out = np.empty_like(points)
+    for p in range(len(points)):
+        turn, shift = turns[group[p]], shifts[group[p]]
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for i in range(3):
+            out[p, i] = turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z + shift[i]
+    return out
