@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from station.depth import CameraView, PointCloud, Preprocessed
+from station.depth import CameraView, Finding, PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
@@ -32,7 +32,7 @@ from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
 from workers.scape.sampling import Sampling
-from workers.scape.surface import fit_surface
+from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,
     PartReport,
@@ -81,6 +81,24 @@ class FitResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class LaidBody:
+    """A body whose surface lies on the cloud; limbs may press into each other."""
+
+    state: BodyState
+    vertices: Array
+    """(P, 3)."""
+    surface: SurfaceFit
+    """The same, unrounded, with what is known of it."""
+    reference: Array | None
+    """(P, 3): the model's own surface in this state; None: the paper's, which is left as it is."""
+    cloud: PointCloud
+    correspondences: int
+    iterations: int
+    camera_shifts_m: dict[str, float]
+    seconds: dict[str, float]
+
+
 @lru_cache(maxsize=2)
 def sampling_of(model: BodyModel) -> Sampling:
     """The model's samples: the same for every scan."""
@@ -100,15 +118,28 @@ def fit_body(
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
+    laid = lay_body(model, scan, method=method, progress=progress, observer=observer)
+    return take_apart(model, laid, scan.findings, observer)
+
+
+def lay_body(
+    model: BodyModel,
+    scan: Preprocessed,
+    *,
+    method: Method = "joint",
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
+) -> LaidBody:
+    """The first part of `fit_body`, after which a body can be measured."""
     _refuse_absurd(scan.cloud)
     # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _fit(model, scan, method, progress, observer)
+        return _laid(model, scan, method, progress, observer)
 
 
-def _fit(
+def _laid(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
-) -> FitResult:
+) -> LaidBody:
     cloud = scan.cloud
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
@@ -120,58 +151,79 @@ def _fit(
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
+    reference = None
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
             model, target, starts[0], lambda share: progress("icp", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
         cameras = CameraCorrections.build(cloud, scan.views)
-        overlapping = surface.vertices
-        fitted = finished = time.monotonic()
+        fitted = time.monotonic()
     else:
         joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
-        cameras = joint.cameras
-        observer("joint", {"vertices": joint.vertices})
+        cameras, reference = joint.cameras, joint.vertices
+        observer("joint", {"vertices": reference})
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
-        surface = fit_surface(model, joint.vertices, cloud)
-        overlapping = surface.vertices
-        free = untangled(model, overlapping, joint.vertices)
-        surface = replace(surface, vertices=free)
-        finished = time.monotonic()
-    observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
-    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
-    shifts = cameras.shifts_m(scan.cloud)
-    stature_m = float(np.ptp(surface.vertices[:, 2]))
-    sides = sides_seen(model, surface.vertices, surface.seen)
-    verdict = judge(parts, sides, scan.findings, unexplained, stature_m, state.beta, shifts)
-    # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
-    # the same scan gives the same file.
-    delivered = np.round(surface.vertices, 7)
+        surface = fit_surface(model, reference, cloud)
+    return LaidBody(
+        state=state,
+        vertices=_rounded(surface.vertices),
+        surface=surface,
+        reference=reference,
+        cloud=cloud,
+        correspondences=used,
+        iterations=iterations,
+        camera_shifts_m=cameras.shifts_m(scan.cloud),
+        seconds={
+            "align": aligned - start,
+            "icp": fitted - aligned,
+            "optimise": time.monotonic() - fitted,
+        },
+    )
+
+
+def take_apart(
+    model: BodyModel, laid: LaidBody, findings: Sequence[Finding], observer: Observer = unobserved
+) -> FitResult:
+    """The second part of `fit_body`: limbs that press into each other are parted, and judged."""
+    start = time.monotonic()
+    surface, vertices = laid.surface, laid.surface.vertices
+    if laid.reference is not None:
+        vertices = untangled(model, vertices, laid.reference)
+    observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
+    parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, laid.cloud)
+    stature_m = float(np.ptp(vertices[:, 2]))
+    sides = sides_seen(model, vertices, surface.seen)
+    verdict = judge(
+        parts, sides, findings, unexplained, stature_m, laid.state.beta, laid.camera_shifts_m
+    )
+    delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(
-        state=state,
+        state=laid.state,
         vertices=delivered,
-        overlapping=np.round(overlapping, 7),
-        cloud=cloud,
+        overlapping=laid.vertices,
+        cloud=laid.cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
         verdict=verdict,
         point_to_surface_rms_m=rms_m,
         coverage=float(surface.seen.mean()),
-        correspondences=used,
-        iterations=iterations,
-        camera_shifts_m=shifts,
-        seconds={
-            "align": aligned - start,
-            "icp": fitted - aligned,
-            "optimise": finished - fitted,
-            "judge": time.monotonic() - finished,
-        },
+        correspondences=laid.correspondences,
+        iterations=laid.iterations,
+        camera_shifts_m=laid.camera_shifts_m,
+        seconds={**laid.seconds, "judge": time.monotonic() - start},
     )
+
+
+def _rounded(vertices: Array) -> Array:
+    """Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does
+    not: the same scan gives the same file."""
+    return np.round(vertices, 7)
 
 
 def _best_start(
