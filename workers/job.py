@@ -21,7 +21,14 @@ from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
 from workers.scape.deformation import vertex_normals
-from workers.scape.fit import LaidBody, Method, fit_body, lay_body, take_apart
+from workers.scape.fit import (
+    LaidBody,
+    Method,
+    fit_body,
+    lay_body,
+    one_thread_in_blas,
+    take_apart,
+)
 from workers.scape.model import BodyModel, load_model
 from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
@@ -120,16 +127,17 @@ def _fitted(
     observer: Observer,
 ) -> JobSummary:
     """Fit, measure, write."""
-    laid = lay_body(model, scan, method=method, progress=progress, observer=observer)
-    progress("measuring", 0.0)
-    # Neither needs what the other finds.
-    with ThreadPoolExecutor(1) as beside:
-        measuring = beside.submit(_measured, model, laid, watch)
-        fit = take_apart(model, laid, scan.findings, observer)
-        measured, standing = measuring.result()
-    watch.seconds.update(fit.seconds)
-    progress("writing", 0.0)
-    write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
+    with one_thread_in_blas():
+        laid = lay_body(model, scan, method, progress, observer)
+        progress("measuring", 0.0)
+        # Neither needs what the other finds.
+        with ThreadPoolExecutor(1) as beside:
+            measuring = beside.submit(_measured, model, laid, watch)
+            fit = take_apart(model, laid, scan.findings, observer)
+            measured, standing = measuring.result()
+        watch.seconds.update(fit.seconds)
+        progress("writing", 0.0)
+        write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
     progress("done", 1.0)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)
 

@@ -118,29 +118,22 @@ def fit_body(
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
-    laid = lay_body(model, scan, method=method, progress=progress, observer=observer)
-    return take_apart(model, laid, scan.findings, observer)
+    with one_thread_in_blas():
+        laid = lay_body(model, scan, method, progress, observer)
+        return take_apart(model, laid, scan.findings, observer)
+
+
+def one_thread_in_blas() -> threadpool_limits:
+    """The order of its sums, and so every bit, stays the same; the other core has other work."""
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def lay_body(
-    model: BodyModel,
-    scan: Preprocessed,
-    *,
-    method: Method = "joint",
-    progress: Progress = lambda step, share: None,  # noqa: ARG005
-    observer: Observer = unobserved,
-) -> LaidBody:
-    """The first part of `fit_body`, after which a body can be measured."""
-    _refuse_absurd(scan.cloud)
-    # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
-    with threadpool_limits(limits=1, user_api="blas"):
-        return _laid(model, scan, method, progress, observer)
-
-
-def _laid(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
 ) -> LaidBody:
+    """The first part of `fit_body`, after which a body can be measured."""
     cloud = scan.cloud
+    _refuse_absurd(cloud)
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
@@ -186,7 +179,7 @@ def _laid(
 
 
 def take_apart(
-    model: BodyModel, laid: LaidBody, findings: Sequence[Finding], observer: Observer = unobserved
+    model: BodyModel, laid: LaidBody, findings: Sequence[Finding], observer: Observer
 ) -> FitResult:
     """The second part of `fit_body`: limbs that press into each other are parted, and judged."""
     start = time.monotonic()
