@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Literal
@@ -139,8 +140,12 @@ def lay_body(
     progress("aligning", 0.0)
     sampling = sampling_of(model)
     scout = sampling.body.first(_SCOUT_SAMPLES)
-    target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
-    starts = starting_states(model, scout, cloud.points[even_subset(len(cloud), _COARSE_POINTS)])
+    most_points = len(cloud) if method == "paper" else _TREE_POINTS
+    few = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
+    with ThreadPoolExecutor(1) as beside:
+        building = beside.submit(Target.build, cloud, scan.views, most_points)
+        starts = starting_states(model, scout, few)
+        target = building.result()
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
