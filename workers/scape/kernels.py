@@ -193,22 +193,27 @@ def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def descend(points, nodes, first, neighbours, start):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(m,): for each point, the node of a graph that no neighbour beats, reached downhill.
+def follow(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """For each point, the node of a graph that no neighbour beats, reached downhill (m,), and
+    whether it is within the limits (m,).
 
     Args:
-        points: (m, k).
-        nodes: (n, k).
+        points: (m, 6): a place and a direction.
+        nodes: (n, 6).
         first: (n + 1,): where each node's neighbours begin.
         neighbours: (e,).
-        start: (m,): the node that each point sets out from.
+        start: (m,): the node that each point sets out from; -1 for points that have none.
+        square: places within the limits have a smaller squared distance ...
+        product: ... and directions a larger product.
     """
-    size = points.shape[1]
-    out = np.empty(len(points), np.int64)
+    out = np.full(len(points), -1, np.int64)
+    within = np.zeros(len(points), np.bool_)
     for p in range(len(points)):
         here = start[p]
+        if here < 0:
+            continue
         least = 0.0
-        for k in range(size):
+        for k in range(6):
             least += (points[p, k] - nodes[here, k]) ** 2
         moved = True
         while moved:
@@ -216,13 +221,17 @@ def descend(points, nodes, first, neighbours, start):  # type: ignore[no-untyped
             origin = here
             for index in range(first[origin], first[origin + 1]):
                 there = neighbours[index]
-                square = 0.0
-                for k in range(size):
-                    square += (points[p, k] - nodes[there, k]) ** 2
-                if square < least:
-                    least, here, moved = square, there, True
-        out[p] = here
-    return out
+                distance = 0.0
+                for k in range(6):
+                    distance += (points[p, k] - nodes[there, k]) ** 2
+                if distance < least:
+                    least, here, moved = distance, there, True
+        apart, along = 0.0, 0.0
+        for k in range(3):
+            apart += (points[p, k] - nodes[here, k]) ** 2
+            along += points[p, 3 + k] * nodes[here, 3 + k]
+        out[p], within[p] = here, apart < square and along > product
+    return out, within
 
 
 @numba.njit(cache=True)
