@@ -20,6 +20,7 @@ from workers.export.meshes import obj_mesh
 from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
+from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
 from workers.scape.fit import (
     LaidBody,
@@ -51,7 +52,10 @@ def warm_up() -> BodyModel:
     """Load everything that the first job would otherwise wait for."""
     model = load_model()
     compile_preprocessing()
-    fit = fit_body(model, Preprocessed(_mean_cloud(model), (), ()))
+    cloud = _mean_cloud(model)
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    # A bare cloud has no cameras that could be off.
+    CameraCorrections(np.zeros((1, 3)), np.eye(6)[None], np.ones((1, 6))).corrected(cloud)
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
     measured = measure_body(model, model.mean)

@@ -81,7 +81,7 @@ class CameraCorrections:
             mine = cloud.points[cloud.camera == index]
             if len(mine):
                 middle = mine.mean(axis=0)[None]
-                moved = self.moved(middle, np.array([index]))
+                moved = self.moved(middle, np.full(1, index, cloud.camera.dtype))
                 found[name] = float(np.linalg.norm(moved - middle))
         return found
 

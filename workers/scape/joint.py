@@ -101,7 +101,7 @@ class Target:
             pulled,
             OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
-            cloud.camera[used].astype(np.intp),
+            cloud.camera[used],
         )
 
 
