@@ -7,6 +7,7 @@ filter the depth images, fit the SCAPE model to them, measure the body.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +19,17 @@ from station.depth.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
 from workers.export.preview import preview
 from workers.export.result import write_result
-from workers.measure.body import measure_body, measure_standing
+from workers.measure.body import MeasuredBody, measure_body, measure_standing
+from workers.scape.cameras import CameraCorrections
 from workers.scape.deformation import vertex_normals
-from workers.scape.fit import FitResult, Method, fit_body
+from workers.scape.fit import (
+    LaidBody,
+    Method,
+    fit_body,
+    lay_body,
+    one_thread_in_blas,
+    take_apart,
+)
 from workers.scape.model import BodyModel, load_model
 from workers.scape.observer import Observer, unobserved
 from workers.scape.skeleton import joint_positions
@@ -43,7 +52,10 @@ def warm_up() -> BodyModel:
     """Load everything that the first job would otherwise wait for."""
     model = load_model()
     compile_preprocessing()
-    fit = fit_body(model, Preprocessed(_mean_cloud(model), (), ()))
+    cloud = _mean_cloud(model)
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    # A bare cloud has no cameras that could be off.
+    CameraCorrections(np.zeros((1, 3)), np.eye(6)[None], np.ones((1, 6))).corrected(cloud)
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
     measured = measure_body(model, model.mean)
@@ -86,8 +98,7 @@ def reconstruct_bundle(
     progress("filtering", 0.0)
     with watch.step("preprocess"):
         scan = preprocess(bundle, volume)
-    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
-    return _finish(model, fit, bundle.scan_id, method, out_folder, watch, progress)
+    return _fitted(model, scan, bundle.scan_id, method, out_folder, watch, progress, observer)
 
 
 def reconstruct_cloud(
@@ -106,25 +117,42 @@ def reconstruct_cloud(
         model = model or load_model()
     with watch.step("preprocess"):
         scan = Preprocessed(cloud, (), ())
-    fit = fit_body(model, scan, method=method, progress=progress, observer=observer)
-    return _finish(model, fit, scan_id, method, out_folder, watch, progress)
+    return _fitted(model, scan, scan_id, method, out_folder, watch, progress, observer)
 
 
-def _finish(
+def _fitted(
     model: BodyModel,
-    fit: FitResult,
+    scan: Preprocessed,
     scan_id: str,
     method: Method,
     out_folder: Path,
     watch: Stopwatch,
     progress: Progress,
+    observer: Observer,
 ) -> JobSummary:
-    watch.seconds.update(fit.seconds)
-    progress("measuring", 0.0)
-    with watch.step("measure"):
-        measured = measure_body(model, fit.overlapping, fit.vertex_sigma_m)
-        standing = measure_standing(model, fit.overlapping, fit.state, fit.vertex_sigma_m)
-    progress("writing", 0.0)
-    write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
+    """Fit, measure, write."""
+    with one_thread_in_blas():
+        laid = lay_body(model, scan, method, progress, observer)
+        progress("measuring", 0.0)
+        # Neither needs what the other finds.
+        with ThreadPoolExecutor(1) as beside:
+            measuring = beside.submit(_measured, model, laid, watch)
+            fit = take_apart(model, laid, scan.findings, observer)
+            measured, standing = measuring.result()
+        watch.seconds.update(fit.seconds)
+        progress("writing", 0.0)
+        write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
     progress("done", 1.0)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)
+
+
+def _measured(
+    model: BodyModel, laid: LaidBody, watch: Stopwatch
+) -> tuple[MeasuredBody, MeasuredBody]:
+    """As scanned, and in the standard standing pose."""
+    with watch.step("measure"):
+        sigma_m = laid.surface.sigma_m
+        return (
+            measure_body(model, laid.vertices, sigma_m),
+            measure_standing(model, laid.vertices, laid.state, sigma_m),
+        )

@@ -12,6 +12,7 @@ from station.calibration.sensor_noise import RANDOM_SIGMA, STEP
 
 _GATE_SIGMAS = 3.0
 _STRAY_READINGS = 2
+_MISSING = np.uint16(65535)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,69 +53,68 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
 
 @numba.njit(cache=True, nogil=True)
 def _average(stack, scale, least, third, depth, count, unsettled, change):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Row by row: what is done to all pixels of a row alike runs in vector registers."""
     frames, height, width = stack.shape
-    values = np.empty(frames, np.float32)
-    order = np.empty(frames, np.float32)
+    ordered = np.empty((frames, width), np.uint16)
+    read = np.empty(width, np.uint8)
+    median, gate = np.empty((2, width), np.float32)
+    # Each under a name of its own: rows by index would keep the compiler from vector registers.
+    total, early, late = np.empty((3, width), np.float32)
+    kept, kept_early, kept_late = np.empty((3, width), np.uint8)
     for y in range(height):
+        _sort(stack, y, ordered, read)
         for x in range(width):
-            valid = 0
-            lowest, highest = np.float32(np.inf), np.float32(0.0)
-            for i in range(frames):
-                value = stack[i, y, x] * scale
-                values[i] = value
-                if value > 0.0:
-                    valid += 1
-                    lowest = min(lowest, value)
-                    highest = max(highest, value)
-            if valid < least:
+            lower, upper = ordered[(read[x] - 1) // 2, x], ordered[read[x] // 2, x]
+            median[x] = np.float32(0.5) * (np.float32(lower) * scale + np.float32(upper) * scale)
+            gate[x] = np.float32(_GATE_SIGMAS * RANDOM_SIGMA + STEP) * median[x] * median[x]
+        for sums, counts in ((total, kept), (early, kept_early), (late, kept_late)):
+            sums[:] = 0.0
+            counts[:] = 0
+        for i in range(frames):
+            _add(stack[i, y], scale, median, gate, total, kept)
+            if i < third:
+                _add(stack[i, y], scale, median, gate, early, kept_early)
+            elif i >= frames - third:
+                _add(stack[i, y], scale, median, gate, late, kept_late)
+        for x in range(width):
+            if read[x] < least:
                 continue
-            # Where even the extremes agree, so does everything with the median, whatever it is.
-            median, gate = lowest, np.float32(np.inf)
-            if highest - lowest > _gate(lowest):
-                median = _median(values, order)
-                gate = _gate(median)
-            total = np.float32(0.0)
-            kept = 0
-            early = np.float32(0.0)
-            early_count = 0
-            late = np.float32(0.0)
-            late_count = 0
-            for i in range(frames):
-                value = values[i]
-                if value > 0.0 and abs(value - median) <= gate:
-                    total += value
-                    kept += 1
-                    if i < third:
-                        early += value
-                        early_count += 1
-                    elif i >= frames - third:
-                        late += value
-                        late_count += 1
-            if valid - kept >= _STRAY_READINGS:
-                unsettled[y, x] = median
-            if kept < least:
+            if read[x] - kept[x] >= _STRAY_READINGS:
+                unsettled[y, x] = median[x]
+            if kept[x] < least:
                 continue
-            depth[y, x] = total / kept
-            count[y, x] = kept
-            if early_count > 0 and late_count > 0:
-                change[y, x] = late / late_count - early / early_count
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _gate(depth):  # type: ignore[no-untyped-def]  # pragma: no cover
-    return np.float32(_GATE_SIGMAS * RANDOM_SIGMA + STEP) * depth * depth
+            depth[y, x] = total[x] / np.int64(kept[x])
+            count[y, x] = kept[x]
+            if kept_early[x] > 0 and kept_late[x] > 0:
+                before = early[x] / np.int64(kept_early[x])
+                change[y, x] = late[x] / np.int64(kept_late[x]) - before
 
 
 @numba.njit(cache=True, nogil=True)
-def _median(values, order):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Of those above zero; order is room to sort them in."""
-    valid = 0
-    for value in values:
-        if value > 0.0:
-            j = valid
-            while j > 0 and order[j - 1] > value:
-                order[j] = order[j - 1]
-                j -= 1
-            order[j] = value
-            valid += 1
-    return np.float32(0.5) * (order[(valid - 1) // 2] + order[valid // 2])
+def _sort(stack, y, ordered, read):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The readings of each pixel of a row, ascending, missing ones last, and how many were read.
+
+    Odd-even transposition sort: it compares whole rows with each other, whatever they hold.
+    """
+    frames, _, width = stack.shape
+    read[:] = 0
+    for i in range(frames):
+        row, out = stack[i, y], ordered[i]
+        for x in range(width):
+            read[x] += row[x] > 0
+            out[x] = row[x] if row[x] > 0 else _MISSING
+    for sweep in range(frames):
+        for i in range(sweep % 2, frames - 1, 2):
+            one, other = ordered[i], ordered[i + 1]
+            for x in range(width):
+                one[x], other[x] = min(one[x], other[x]), max(one[x], other[x])
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(row, scale, median, gate, total, kept):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add those readings of a row that lie within the gates of their medians."""
+    for x in range(len(row)):
+        value = np.float32(row[x]) * scale
+        agrees = (value > 0.0) & (abs(value - median[x]) <= gate[x])
+        total[x] += value if agrees else np.float32(0.0)
+        kept[x] += agrees

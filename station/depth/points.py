@@ -55,11 +55,6 @@ def project(camera: CameraCalibration, points: NDArray[np.float64]) -> NDArray[n
     return np.where(ahead[:, None], pixels, np.nan)
 
 
-def camera_points(camera: CameraCalibration, depth_m: Image) -> Image:
-    """(h, w, 3) points in the camera frame; zeros where there is no reading."""
-    return rays(camera) * depth_m[..., None]
-
-
 @numba.njit(cache=True, nogil=True)
 def within(rays_, depth_m, world_from_camera, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     """(h, w): readings whose points lie in a box of the world.
@@ -101,32 +96,40 @@ def normals(points: Image, depth_m: Image) -> tuple[Image, NDArray[np.bool_]]:
 
     From central differences over a few pixels that lie on one surface.
     """
-    r = _NORMAL_REACH_PX
-    result = np.zeros_like(points)
-    right, left = points[r:-r, 2 * r :], points[r:-r, : -2 * r]
-    below, above = points[2 * r :, r:-r], points[: -2 * r, r:-r]
-    inner = cross(below - above, right - left)
-    length = np.sqrt(np.einsum("hwi,hwi->hw", inner, inner))
-    center = depth_m[r:-r, r:-r]
-    whole = center > 0
-    for neighbour in (
-        depth_m[r:-r, 2 * r :], depth_m[r:-r, : -2 * r],
-        depth_m[2 * r :, r:-r], depth_m[: -2 * r, r:-r],
-    ):  # fmt: skip
-        whole &= (neighbour > 0) & (np.abs(neighbour - center) < _JUMP_RATIO * r * center)
-    whole &= length > 0
-    result[r:-r, r:-r] = np.where(whole[..., None], inner / np.maximum(length, 1e-12)[..., None], 0)
-    valid = np.zeros(depth_m.shape, bool)
-    valid[r:-r, r:-r] = whole
-    facing = np.einsum("hwi,hwi->hw", result, points) > 0
-    result[facing] *= -1.0
+    return _normals(points, depth_m, _NORMAL_REACH_PX, np.float32(_JUMP_RATIO * _NORMAL_REACH_PX))
+
+
+@numba.njit(cache=True, nogil=True)
+def _normals(points, depth_m, reach, jump):  # type: ignore[no-untyped-def]  # pragma: no cover
+    height, width = depth_m.shape
+    result, valid = np.zeros_like(points), np.zeros((height, width), np.bool_)
+    for v in range(reach, height - reach):
+        for u in range(reach, width - reach):
+            gate = jump * depth_m[v, u]
+            if not (
+                _near(depth_m[v, u + reach], depth_m[v, u], gate)
+                and _near(depth_m[v, u - reach], depth_m[v, u], gate)
+                and _near(depth_m[v + reach, u], depth_m[v, u], gate)
+                and _near(depth_m[v - reach, u], depth_m[v, u], gate)
+            ):
+                continue
+            right, left = points[v, u + reach], points[v, u - reach]
+            below, above = points[v + reach, u], points[v - reach, u]
+            a, b, c = below[0] - above[0], below[1] - above[1], below[2] - above[2]
+            d, e, f = right[0] - left[0], right[1] - left[1], right[2] - left[2]
+            x, y, z = b * f - c * e, c * d - a * f, a * e - b * d
+            length = np.sqrt(x * x + y * y + z * z)
+            if length == 0.0:
+                continue
+            here, out = points[v, u], result[v, u]
+            if x * here[0] + y * here[1] + z * here[2] > 0.0:
+                length = -length
+            out[0], out[1], out[2] = x / length, y / length, z / length
+            valid[v, u] = True
     return result, valid
 
 
-def cross(a: Image, b: Image) -> Image:
-    """Cross product along the last axis; numpy's own is several times slower."""
-    out = np.empty_like(a)
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
+@numba.njit(cache=True, nogil=True, inline="always")
+def _near(neighbour, center, gate):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether two readings lie on one surface."""
+    return neighbour > 0.0 and center > 0.0 and abs(neighbour - center) < gate

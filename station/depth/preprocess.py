@@ -16,7 +16,7 @@ from station.bundle import Bundle
 from station.calibration.rig import CameraCalibration
 from station.depth.average import average, random_sigma_m
 from station.depth.people import count_people
-from station.depth.points import Image, camera_points, jumps, normals, rays, within
+from station.depth.points import Image, jumps, normals, rays, within
 from station.errors import InputError
 
 Array = NDArray[np.float64]
@@ -33,6 +33,8 @@ _SECOND_PERSON_HEIGHT_M = 1.1
 """A chair that stands apart harms nothing; another adult is another scan."""
 _PEOPLE_STRIDE = 4
 _MOTION_M = 0.010
+_MOTION_STRIDE = 4
+"""Neighbours moved alike."""
 _UNSETTLED_SHARE = 0.25
 _PLENTY_OF_FRAMES = 10
 """A scan that has so many lacks none, however long it took to get them."""
@@ -108,6 +110,7 @@ def warm_up() -> None:
     # As `rays` gives them: what may be written to is another type, compiled apart.
     nothing.flags.writeable = False
     within(nothing, np.zeros((1, 1), np.float32), np.eye(4), np.zeros(3), np.zeros(3))
+    normals(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,33 +178,34 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     part = np.ascontiguousarray(depth[window])
     edge = jumps(part)
     typical = float(np.median(part[near[window]]))
-    smooth = cv2.bilateralFilter(
+    smooth: Image = cv2.bilateralFilter(
         part,
         _BILATERAL_DIAMETER_PX,
         _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical))),
         _BILATERAL_SPACE_PX,
-    )
+    )  # type: ignore[assignment]  # the type of what it is given
     smooth[part == 0] = 0.0
-    image = np.zeros_like(depth)
-    image[window] = smooth
-    points = camera_points(calibration, image)[window]
-    directions, valid = normals(points, image[window])
+    depth[window] = np.where(smooth > 0, smooth, part)
+    points = rays(calibration)[window] * smooth[..., None]
+    directions, valid = normals(points, smooth)
     distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
     cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
     valid &= near[window] & ~edge & (cosine > _MAX_INCIDENCE_COSINE)
-    y, x = np.nonzero(valid)
-    readings = averaged.count[window][valid].astype(np.float64)
-    sigma = random_sigma_m(smooth[valid].astype(np.float64)) / np.sqrt(readings * cosine[valid])
-    local = points[valid].astype(np.float64)
+    at = np.flatnonzero(valid)
+    y, x = np.unravel_index(at, valid.shape)
+    readings = averaged.count[window].ravel()[at].astype(np.float64)
+    sigma = random_sigma_m(smooth.ravel()[at].astype(np.float64))
+    sigma /= np.sqrt(readings * cosine.ravel()[at])
+    local = points.reshape(-1, 3)[at].astype(np.float64)
     pose = calibration.world_from_camera
     return _Camera(
         calibration=calibration,
-        depth_m=np.where(image > 0, image, depth),
+        depth_m=depth,
         pixels=(y + top) * depth.shape[1] + (x + left),
         points=local @ pose[:3, :3].T + pose[:3, 3],
-        normals=directions[valid].astype(np.float64) @ pose[:3, :3].T,
+        normals=directions.reshape(-1, 3)[at].astype(np.float64) @ pose[:3, :3].T,
         sigma_m=np.hypot(sigma, _SIGMA_FLOOR_M),
-        change_m=averaged.change_m[window][valid].astype(np.float64),
+        change_m=averaged.change_m[window].ravel()[at].astype(np.float64),
         unsettled=unsettled,
         frames=len(bundle.frames[name]),
         ordered=_ordered(bundle, name),
@@ -228,10 +232,12 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
             "the booth is empty: the cameras see nobody in its volume; "
             "ask the person to stand on the mark, or check volume in booth.toml"
         )
-    low = everything.min(axis=0) - 2 * _VOXEL_M
-    cells = ((everything - low) / _VOXEL_M).astype(np.int64)
-    shape = tuple(cells.max(axis=0) + 3)
-    cell = np.ravel_multi_index(tuple(cells.T), shape)
+    # A coordinate a row: minima along long rows are quick.
+    rows = everything.T.copy()
+    low = rows.min(axis=1, keepdims=True) - 2 * _VOXEL_M
+    cells = ((rows - low) / _VOXEL_M).astype(np.int64)
+    shape = tuple(cells.max(axis=1) + 3)
+    cell = np.ravel_multi_index(tuple(cells), shape)
     occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
     labels, count = ndimage.label(ndimage.binary_dilation(occupied >= 3))
     of_point = labels.ravel()[cell]
@@ -246,7 +252,7 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
         if label != main
     )
     findings = []
-    if beside or count_people(everything[keep][::_PEOPLE_STRIDE]) > 1:
+    if beside or count_people(everything[np.flatnonzero(keep)[::_PEOPLE_STRIDE]]) > 1:
         message = "two people (or a large object) in the booth"
         findings.append(Finding("two-people", None, None, message))
     ends = np.cumsum([len(part) for part in points])
@@ -305,8 +311,8 @@ def _motion(camera: _Camera, keep: Mask) -> float:
 
     The depth changes are explained by one shift t: n . t = (n . ray) change, in least squares.
     """
-    chosen = keep & np.isfinite(camera.change_m)
-    if chosen.sum() < 500:
+    chosen = np.flatnonzero(keep & np.isfinite(camera.change_m))[::_MOTION_STRIDE]
+    if len(chosen) < 125:
         return 0.0
     pose = camera.calibration.world_from_camera
     offsets = camera.points[chosen] - pose[:3, 3]

@@ -13,7 +13,7 @@ from station.drivers.virtual_scene import sphere
 from workers.scape.correspondence import Followers, OrientedTree
 from workers.scape.deformation import EdgeSolver, area_vectors, edges, neighbours, vertex_normals
 from workers.scape.initial import posed, starting_states
-from workers.scape.kernels import conjugate_gradients, descend, trimmed_costs
+from workers.scape.kernels import conjugate_gradients, follow, trimmed_costs
 from workers.scape.model import BodyModel, load_model
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
@@ -80,24 +80,39 @@ def test_trimmed_costs_are_trimmed_means_both_ways(size: int) -> None:
 
 def test_downhill_ends_where_no_neighbour_is_nearer() -> None:
     rng = np.random.default_rng(2)
-    first, joined = neighbours(BALL.faces)
-    points = BALL.vertices.mean(axis=0) + 0.4 * rng.standard_normal((300, 3))
-    start = rng.integers(0, len(BALL.vertices), 300)
-    found = descend(points, BALL.vertices, first, joined, start)
+    graph = neighbours(BALL.faces)
+    first, joined = graph
+    normals = vertex_normals(BALL.vertices, BALL.faces)
+    nodes = np.concatenate([BALL.vertices, 0.1 * normals], axis=1)
+    points = nodes.mean(axis=0) + 0.4 * rng.standard_normal((300, 6))
+    start = rng.integers(0, len(nodes), 300)
+    found, _ = follow(points, nodes, *graph, start, np.inf, -np.inf)
 
     def away(index: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(points - BALL.vertices[index], axis=1)
+        return np.linalg.norm(points - nodes[index], axis=1)
 
     assert (away(found) <= away(start)).all()
     for point, vertex in zip(points, found, strict=True):
-        around = BALL.vertices[joined[first[vertex] : first[vertex + 1]]]
-        least = np.linalg.norm(point - BALL.vertices[vertex])
+        around = nodes[joined[first[vertex] : first[vertex + 1]]]
+        least = np.linalg.norm(point - nodes[vertex])
         assert (np.linalg.norm(around - point, axis=1) >= least - 1e-12).all()
     # A ball has no hollow in which to stop short.
-    outside = BALL.vertices[start] + 0.01 * vertex_normals(BALL.vertices, BALL.faces)[start]
-    assert np.array_equal(
-        descend(outside, BALL.vertices, first, joined, rng.permutation(start)), start
-    )
+    outside = nodes[start] + np.concatenate([0.01 * normals[start], np.zeros((300, 3))], axis=1)
+    found, _ = follow(outside, nodes, *graph, rng.permutation(start), np.inf, -np.inf)
+    assert np.array_equal(found, start)
+
+
+def test_followers_are_held_to_the_limits_and_may_have_no_start() -> None:
+    normals = vertex_normals(BALL.vertices, BALL.faces)
+    nodes = np.concatenate([BALL.vertices, normals], axis=1)
+    start = np.array([5, 5, 5, -1])
+    points = nodes[[5, 5, 5, 5]]
+    points[1, :3] += 0.011 * normals[5]
+    points[2, 3:] *= -0.01
+    found, kept = follow(points, nodes, *neighbours(BALL.faces), start, 0.01**2, 0.9)
+    assert found[0] == 5
+    assert found[3] == -1
+    assert kept.tolist() == [True, False, False, False]
 
 
 def _skin_points(

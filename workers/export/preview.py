@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -67,10 +68,12 @@ def preview(
 ) -> bytes:
     """The picture as PNG."""
     by_name = {measurement.name: measurement for measurement in measurements}
-    scene = Scene(vertices, faces)
+    frames = [_frame(vertices, view) for view in _SHOWN]
+    with ThreadPoolExecutor(2) as pool:
+        renderings = list(pool.map(Scene(vertices, faces).render, frames))
     panels = [
-        _panel(scene, vertices, view, _rows(by_name, left), _rows(by_name, right))
-        for view, (left, right) in _SHOWN.items()
+        _panel(frame, rendering, _rows(by_name, left), _rows(by_name, right))
+        for frame, rendering, (left, right) in zip(frames, renderings, _SHOWN.values(), strict=True)
     ]
     picture = np.concatenate(panels, axis=1)
     strip = np.full((_STRIP, picture.shape[1], 3), BACKGROUND, np.uint8)
@@ -89,21 +92,20 @@ def _label(row: Measurement) -> str:
     return f"{' '.join(words)}  {100 * row.value_m:.1f} cm"
 
 
-def _panel(
-    scene: Scene,
-    vertices: Array,
-    view: str,
-    left: list[Measurement],
-    right: list[Measurement],
-) -> Picture:
-    """One view with its labels beside the body."""
+def _frame(vertices: Array, view: str) -> Frame:
+    """The whole body in a view, with room for its stature's line."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = float(high[2] - low[2]) / _BODY_PIXELS
     across = float(np.ptp(vertices[:, 0 if view != "side" else 1]))
     x, y, z = (float(value) for value in 0.5 * (low + high))
     room = 2 * (_STATURE_GAP + 4)
-    frame = Frame(view, int(across / scale) + room, _BODY_PIXELS + 2 * _BORDER, scale, (x, y, z))
-    rendering = scene.render(frame)
+    return Frame(view, int(across / scale) + room, _BODY_PIXELS + 2 * _BORDER, scale, (x, y, z))
+
+
+def _panel(
+    frame: Frame, rendering: Rendering, left: list[Measurement], right: list[Measurement]
+) -> Picture:
+    """One view with its labels beside the body."""
     columns = [max((text_width(_label(row), size=_SIZE) for row in rows), default=0) + 2 * _GAP
                for rows in (left, right)]  # fmt: skip
     picture = np.full((frame.height, sum(columns) + frame.width, 3), BACKGROUND, np.uint8)

@@ -82,6 +82,7 @@ def _measured(
     model: BodyModel, vertices: Array, shown: Array, pose: Pose, vertex_sigma_m: Array | None
 ) -> MeasuredBody:
     traces = trace_all(model, vertices)
+    values = row_values(traces, pose)
     rows = tuple(
         Measurement(
             trace.definition.name,
@@ -92,7 +93,7 @@ def _measured(
             trace.closed,
         )
         for trace, value, interval in zip(
-            traces, row_values(traces, pose), intervals(traces, vertex_sigma_m, pose), strict=True
+            traces, values, intervals(traces, values, vertex_sigma_m, pose), strict=True
         )
     )
     volume = signed_volume(vertices, model.faces)

@@ -153,10 +153,10 @@ def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
 
 
 def intervals(
-    traces: Sequence[Trace], vertex_sigma_m: Array | None, pose: Pose
+    traces: Sequence[Trace], values: Sequence[float], vertex_sigma_m: Array | None, pose: Pose
 ) -> list[tuple[float, float]]:
-    """The 95 % interval of each row; without a posterior the mesh itself is the truth."""
-    values = row_values(traces, pose)
+    """The 95 % interval of each row, about the value that `row_values` gives it; without a
+    posterior the mesh itself is the truth."""
     if vertex_sigma_m is None:
         return [(value, value) for value in values]
     found = []

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from station.depth import CameraView, PointCloud
 from station.geometry import rigid, so3_exp
+from workers.scape.kernels import moved
 
 Array = NDArray[np.float64]
 Index = NDArray[np.integer]
@@ -61,22 +62,17 @@ class CameraCorrections:
         """The cloud where the corrections have it."""
         if not len(self):
             return cloud
-        normals = np.empty_like(cloud.normals)
-        for index, turn in enumerate(so3_exp(self.xi[:, :3])):
-            mine = cloud.camera == index
-            normals[mine] = cloud.normals[mine] @ turn.T
+        turns = so3_exp(self.xi[:, :3])
+        normals = moved(cloud.normals, cloud.camera, turns, np.zeros_like(self.eyes))
         return replace(cloud, points=self.moved(cloud.points, cloud.camera), normals=normals)
 
     def moved(self, points: Array, camera: Index) -> Array:
         """Points (n, 3) of cameras (n,) where the corrections have them."""
         if not self.xi.any():
             return points
-        found = np.empty_like(points)
-        for index, turn in enumerate(so3_exp(self.xi[:, :3])):
-            mine = camera == index
-            eye = self.eyes[index]
-            found[mine] = (points[mine] - eye) @ turn.T + (eye + self.xi[index, 3:])
-        return found
+        turns = so3_exp(self.xi[:, :3])
+        shifts = self.eyes + self.xi[:, 3:] - np.einsum("cij,cj->ci", turns, self.eyes)
+        return np.asarray(moved(points, camera, turns, shifts))
 
     def poses(self, views: Sequence[CameraView]) -> list[Array]:
         """world_from_camera (4, 4) of the cloud's views where the corrections have them."""
@@ -94,7 +90,7 @@ class CameraCorrections:
             mine = cloud.points[cloud.camera == index]
             if len(mine):
                 middle = mine.mean(axis=0)[None]
-                moved = self.moved(middle, np.array([index]))
+                moved = self.moved(middle, np.full(1, index, cloud.camera.dtype))
                 found[name] = float(np.linalg.norm(moved - middle))
         return found
 

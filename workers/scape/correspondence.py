@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from workers.scape.deformation import Graph
-from workers.scape.kernels import descend
+from workers.scape.kernels import follow
 
 Array = NDArray[np.float64]
 
@@ -83,27 +84,37 @@ class Followers:
         self, vertices: Array, normals: Array, *, max_distance_m: float, max_angle_rad: float
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Those of the points that have a compatible vertex (P, 3), and which."""
-        limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
-        last = self._vertex
-        if last is None:
-            tree = OrientedTree.build(vertices, normals)
-            last = self._scouted(tree, limits)
-        known = np.flatnonzero(last >= 0)
-        here = descend(self._place[known], _joined(vertices, normals), *self._graph, last[known])
-        kept = compatible(
-            vertices[here] - self.points[known], self.normals[known], normals[here], **limits
-        )
-        found = np.full(len(self.points), -1, np.intp)
-        found[known[kept]] = here[kept]
-        last[known] = here
+        nodes = _joined(vertices, normals)
+        square, product = max_distance_m**2, _DIRECTION_SCALE_M**2 * np.cos(max_angle_rad)
         if self._vertex is None:
+            tree = OrientedTree.build(vertices, normals)
+            limits = {"max_distance_m": max_distance_m, "max_angle_rad": max_angle_rad}
+            self._vertex = self._scouted(tree, limits)
+            here, kept = self._led(nodes, self._vertex, square, product)
             # Whom a scout led astray is searched for by itself.
-            lost = np.flatnonzero(found < 0)
+            lost = np.flatnonzero(~kept)
             again, anew = tree.pairs(self.points[lost], self.normals[lost], **limits)
-            found[lost[again]] = last[lost[again]] = anew
-            self._vertex = last
-        used = np.flatnonzero(found >= 0)
-        return used, found[used]
+            here[lost[again]], kept[lost[again]] = anew, True
+        else:
+            here, kept = self._led(nodes, self._vertex, square, product)
+        self._vertex = here
+        used = np.flatnonzero(kept)
+        return used, here[used]
+
+    def _led(
+        self, nodes: Array, start: NDArray[np.intp], square: float, product: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """`follow`, half of the points beside the other half."""
+        count = len(start)
+        with ThreadPoolExecutor(_threads(count)) as pool:
+            halves = pool.map(
+                lambda half: follow(
+                    self._place[half], nodes, *self._graph, start[half], square, product
+                ),
+                (slice(0, count // 2), slice(count // 2, count)),
+            )
+            here, kept = (np.concatenate(parts) for parts in zip(*halves, strict=True))
+        return here, kept
 
     def _scouted(self, tree: OrientedTree, limits: dict[str, float]) -> NDArray[np.intp]:
         """(n,): where each point sets out from, -1 where nothing was found."""

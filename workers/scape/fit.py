@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from station.depth import CameraView, PointCloud, Preprocessed
+from station.depth import CameraView, Finding, PointCloud, Preprocessed
 from station.errors import InputError
 from workers.scape.cameras import CameraCorrections
 from workers.scape.crown import reach
@@ -33,7 +34,7 @@ from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
 from workers.scape.sampling import Sampling
-from workers.scape.surface import fit_surface
+from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,
     PartReport,
@@ -52,8 +53,8 @@ _LEAST_POINTS = 1500
 _TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
-_FEWER = 5
-"""Of the points: enough to tell where the toes are."""
+_FACING_POINTS = 6000
+"""Enough to tell where the toes are."""
 _MOST_STARTS = 4
 _EXPLAINED = 0.008
 
@@ -84,6 +85,24 @@ class FitResult:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class LaidBody:
+    """A body whose surface lies on the cloud; limbs may press into each other."""
+
+    state: BodyState
+    vertices: Array
+    """(P, 3)."""
+    surface: SurfaceFit
+    """The same, unrounded, with what is known of it."""
+    reference: Array | None
+    """(P, 3): the model's own surface in this state; None: the paper's, which is left as it is."""
+    cloud: PointCloud
+    correspondences: int
+    iterations: int
+    camera_shifts_m: dict[str, float]
+    seconds: dict[str, float]
+
+
 @lru_cache(maxsize=2)
 def sampling_of(model: BodyModel) -> Sampling:
     """The model's samples: the same for every scan."""
@@ -103,80 +122,114 @@ def fit_body(
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
-    _refuse_absurd(scan.cloud)
-    # One thread in the linear algebra: the sums' order, and so every bit, stays the same.
-    with threadpool_limits(limits=1, user_api="blas"):
-        return _fit(model, scan, method, progress, observer)
+    with one_thread_in_blas():
+        laid = lay_body(model, scan, method, progress, observer)
+        return take_apart(model, laid, scan.findings, observer)
 
 
-def _fit(
+def one_thread_in_blas() -> threadpool_limits:
+    """The order of its sums, and so every bit, stays the same; the other core has other work."""
+    return threadpool_limits(limits=1, user_api="blas")
+
+
+def lay_body(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
-) -> FitResult:
+) -> LaidBody:
+    """The first part of `fit_body`, after which a body can be measured."""
     cloud = scan.cloud
+    _refuse_absurd(cloud)
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
     scout = sampling.body.first(_SCOUT_SAMPLES)
-    target = Target.build(cloud, scan.views, len(cloud) if method == "paper" else _TREE_POINTS)
-    coarse = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
-    starts = starting_states(model, scout, coarse, facing_deg(target.tree.points[::_FEWER]))
+    most_points = len(cloud) if method == "paper" else _TREE_POINTS
+    few = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
+    with ThreadPoolExecutor(1) as beside:
+        building = beside.submit(Target.build, cloud, scan.views, most_points)
+        starts = starting_states(model, scout, few, facing_deg(_thinned(cloud.points)))
+        target = building.result()
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
+    reference = None
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
             model, target, starts[0], lambda share: progress("icp", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
         cameras = CameraCorrections.build(cloud, scan.views)
-        overlapping = surface.vertices
-        fitted = finished = time.monotonic()
+        fitted = time.monotonic()
     else:
         joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
-        cameras = joint.cameras
-        observer("joint", {"vertices": joint.vertices})
+        cameras, reference = joint.cameras, joint.vertices
+        observer("joint", {"vertices": reference})
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         crown = partial(reach, model, scan.views, cameras.poses(scan.views))
-        surface = fit_surface(model, joint.vertices, cloud, crown)
-        overlapping = surface.vertices
-        free = untangled(model, overlapping, joint.vertices)
-        surface = replace(surface, vertices=free)
-        finished = time.monotonic()
-    observer("surface", {"vertices": surface.vertices, "residual_m": surface.residual_m})
-    parts, rms_m, unexplained = report_parts(model, surface.vertices, surface.seen, cloud)
-    shifts = cameras.shifts_m(scan.cloud)
-    stature_m = float(np.ptp(surface.vertices[:, 2]))
-    sides = sides_seen(model, surface.vertices, surface.seen)
-    verdict = judge(parts, sides, scan.findings, unexplained, stature_m, state.beta, shifts)
-    # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
-    # the same scan gives the same file.
-    delivered = np.round(surface.vertices, 7)
+        surface = fit_surface(model, reference, cloud, crown)
+    return LaidBody(
+        state=state,
+        vertices=_rounded(surface.vertices),
+        surface=surface,
+        reference=reference,
+        cloud=cloud,
+        correspondences=used,
+        iterations=iterations,
+        camera_shifts_m=cameras.shifts_m(scan.cloud),
+        seconds={
+            "align": aligned - start,
+            "icp": fitted - aligned,
+            "optimise": time.monotonic() - fitted,
+        },
+    )
+
+
+def take_apart(
+    model: BodyModel, laid: LaidBody, findings: Sequence[Finding], observer: Observer
+) -> FitResult:
+    """The second part of `fit_body`: limbs that press into each other are parted, and judged."""
+    start = time.monotonic()
+    surface, vertices = laid.surface, laid.surface.vertices
+    if laid.reference is not None:
+        vertices = untangled(model, vertices, laid.reference)
+    observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
+    parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, laid.cloud)
+    stature_m = float(np.ptp(vertices[:, 2]))
+    sides = sides_seen(model, vertices, surface.seen)
+    verdict = judge(
+        parts, sides, findings, unexplained, stature_m, laid.state.beta, laid.camera_shifts_m
+    )
+    delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(
-        state=state,
+        state=laid.state,
         vertices=delivered,
-        overlapping=np.round(overlapping, 7),
-        cloud=cloud,
+        overlapping=laid.vertices,
+        cloud=laid.cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
         verdict=verdict,
         point_to_surface_rms_m=rms_m,
         coverage=float(surface.seen.mean()),
-        correspondences=used,
-        iterations=iterations,
-        camera_shifts_m=shifts,
-        seconds={
-            "align": aligned - start,
-            "icp": fitted - aligned,
-            "optimise": finished - fitted,
-            "judge": time.monotonic() - finished,
-        },
+        correspondences=laid.correspondences,
+        iterations=laid.iterations,
+        camera_shifts_m=laid.camera_shifts_m,
+        seconds={**laid.seconds, "judge": time.monotonic() - start},
     )
+
+
+def _thinned(points: Array) -> Array:
+    return points[:: max(1, len(points) // _FACING_POINTS)]
+
+
+def _rounded(vertices: Array) -> Array:
+    """Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does
+    not: the same scan gives the same file."""
+    return np.round(vertices, 7)
 
 
 def _best_start(

@@ -145,8 +145,7 @@ def _grown(mask: Mask, mean: sp.csr_matrix, rings: int) -> Mask:
 @lru_cache(maxsize=2)
 def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
     """(P, P): takes values to the means of their neighbours'."""
-    linked = (model.solver.laplacian != 0).astype(np.float64).tolil()
-    linked.setdiag(0.0)
-    linked = linked.tocsr()
+    linked = abs(model.solver.laplacian).sign()
+    linked = (linked - sp.diags(linked.diagonal())).tocsr()
     linked.eliminate_zeros()
     return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()

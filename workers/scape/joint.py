@@ -105,7 +105,7 @@ class Target:
             OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
             tuple(views),
-            cloud.camera[used].astype(np.intp),
+            cloud.camera[used],
         )
 
 
@@ -140,15 +140,15 @@ def fit_jointly(
     pulled = target.pulled
     followers = Followers(model.neighbours, target.tree.points[pulled], target.tree.normals[pulled])
     terms: _DataTerms | None = None
-    with ThreadPoolExecutor(max_workers=1) as beside:
+    # What need not wait for one another is done side by side.
+    with ThreadPoolExecutor(max_workers=2) as beside:
         for step, stage in enumerate(schedule):
+            samples = sampling.body.first(stage.samples)
+            derivative = beside.submit(samples.jacobian, state, stage.components)
             skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
-            # What the correspondences need not wait for is done beside them.
             probed = beside.submit(_probed, target, skin, stage)
-            derivative = beside.submit(
-                sampling.body.first(stage.samples).jacobian, state, stage.components
-            )
-            terms = _data_terms(model, target, followers, probed, cameras, skin, stage)
+            bounds = beside.submit(_bounds, model, target, cameras, skin, stage)
+            terms = _data_terms(target, followers, probed, bounds, cameras, skin, stage)
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
@@ -180,16 +180,28 @@ def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp],
     return probes[probing], target.pulled[found] if stage.coarse else found
 
 
+def _bounds(
+    model: BodyModel, target: Target, cameras: CameraCorrections, skin: Skin, stage: Stage
+) -> tuple[Rows, ...]:
+    """What floor, outlines and crown say."""
+    floor = floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))
+    if stage.coarse:
+        return (floor,)
+    poses = cameras.poses(target.views)
+    outline = outline_rows(model, target.free_space, poses, skin, stage.row_share)
+    return floor, outline, crown_rows(reach(model, target.views, poses, skin.positions))
+
+
 def _data_terms(
-    model: BodyModel,
     target: Target,
     followers: Followers,
     probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
+    bounds: Future[tuple[Rows, ...]],
     cameras: CameraCorrections,
     skin: Skin,
     stage: Stage,
 ) -> _DataTerms:
-    """Correspondences, floor, outlines and crown, summed up at the samples."""
+    """Correspondences and bounds, summed up at the samples."""
     cloud = target.tree
     if stage.coarse:
         pulled = target.pulled[::_COARSELY_PULLED]
@@ -209,18 +221,13 @@ def _data_terms(
     variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
     robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
     pairs = Rows(place, direction, residual, stage.row_share * robust / variance)
-    rows = [pairs, floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))]
     camera_terms = None
-    if not stage.coarse:
-        poses = cameras.poses(target.views)
-        rows.append(outline_rows(model, target.free_space, poses, skin, stage.row_share))
-        rows.append(crown_rows(reach(model, target.views, poses, skin.positions)))
-        if len(cameras):
-            derivative = cameras.derivative(on_cloud, camera, direction)
-            camera_terms = CameraTerms.build(
-                pairs, derivative, camera, len(cameras), skin, stage.samples
-            )
-    weight, pull = Rows.joined(*rows).at_samples(skin, stage.samples)
+    if len(cameras) and not stage.coarse:
+        derivative = cameras.derivative(on_cloud, camera, direction)
+        camera_terms = CameraTerms.build(
+            pairs, derivative, camera, len(cameras), skin, stage.samples
+        )
+    weight, pull = Rows.joined(pairs, *bounds.result()).at_samples(skin, stage.samples)
     return _DataTerms(weight, pull, camera_terms, on_body, on_cloud)
 
 

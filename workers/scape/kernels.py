@@ -112,9 +112,11 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
     """
     tries, size, count = tried.shape
     result = np.empty(tries)
-    square = np.empty(count, np.float32)
+    square, back = np.empty((2, count), np.float32)
+    # Squares compare as the whole numbers that their bits are, and those have a vector minimum.
+    square_bits, back_bits = square.view(np.int32), back.view(np.int32)
     for h in range(tries):
-        back = np.full(count, np.float32(1e9))
+        back[:] = np.float32(np.inf)
         total = 0.0
         for p in range(len(cloud)):
             # Three coordinates at a time: one pass over memory, in vector registers.
@@ -125,11 +127,11 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
                     x, y, z = row0[s] - here0, row1[s] - here1, row2[s] - here2
                     before = square[s] if k > 0 else np.float32(0.0)
                     square[s] = before + x * x + y * y + z * z
-            least = np.float32(1e9)
+            least = square_bits[0]
             for s in range(count):
-                least = min(least, square[s])
-                back[s] = min(back[s], square[s])
-            total += min(np.sqrt(least), cloud_cut)
+                least = min(least, square_bits[s])
+                back_bits[s] = min(back_bits[s], square_bits[s])
+            total += min(np.sqrt(np.int32(least).view(np.float32)), cloud_cut)
         other = 0.0
         for s in range(count):
             other += min(np.sqrt(back[s]), tried_cut)
@@ -191,22 +193,27 @@ def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def descend(points, nodes, first, neighbours, start):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(m,): for each point, the node of a graph that no neighbour beats, reached downhill.
+def follow(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """For each point, the node of a graph that no neighbour beats, reached downhill (m,), and
+    whether it is within the limits (m,).
 
     Args:
-        points: (m, k).
-        nodes: (n, k).
+        points: (m, 6): a place and a direction.
+        nodes: (n, 6).
         first: (n + 1,): where each node's neighbours begin.
         neighbours: (e,).
-        start: (m,): the node that each point sets out from.
+        start: (m,): the node that each point sets out from; -1 for points that have none.
+        square: places within the limits have a smaller squared distance ...
+        product: ... and directions a larger product.
     """
-    size = points.shape[1]
-    out = np.empty(len(points), np.int64)
+    out = np.full(len(points), -1, np.int64)
+    within = np.zeros(len(points), np.bool_)
     for p in range(len(points)):
         here = start[p]
+        if here < 0:
+            continue
         least = 0.0
-        for k in range(size):
+        for k in range(6):
             least += (points[p, k] - nodes[here, k]) ** 2
         moved = True
         while moved:
@@ -214,13 +221,17 @@ def descend(points, nodes, first, neighbours, start):  # type: ignore[no-untyped
             origin = here
             for index in range(first[origin], first[origin + 1]):
                 there = neighbours[index]
-                square = 0.0
-                for k in range(size):
-                    square += (points[p, k] - nodes[there, k]) ** 2
-                if square < least:
-                    least, here, moved = square, there, True
-        out[p] = here
-    return out
+                distance = 0.0
+                for k in range(6):
+                    distance += (points[p, k] - nodes[there, k]) ** 2
+                if distance < least:
+                    least, here, moved = distance, there, True
+        apart, along = 0.0, 0.0
+        for k in range(3):
+            apart += (points[p, k] - nodes[here, k]) ** 2
+            along += points[p, 3 + k] * nodes[here, 3 + k]
+        out[p], within[p] = here, apart < square and along > product
+    return out, within
 
 
 @numba.njit(cache=True)
@@ -297,3 +308,16 @@ def _place(position, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: 
     position[0] += turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
     position[1] += turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
     position[2] += turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+
+
+@numba.njit(cache=True, nogil=True)
+def moved(points, group, turns, shifts):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """(n, 3): points of groups (n,), each turned by its group's matrix (g, 3, 3), then shifted by
+    its (g, 3)."""
+    out = np.empty_like(points)
+    for p in range(len(points)):
+        turn, shift = turns[group[p]], shifts[group[p]]
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for i in range(3):
+            out[p, i] = turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z + shift[i]
+    return out
