@@ -5,11 +5,10 @@ glTF is y up and metric; the world is z up, so (x, y, z) becomes (x, z, -y).
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+import pygltflib as gltf
 from numpy.typing import NDArray
 
 from workers.measure.body import Measurement
@@ -24,10 +23,6 @@ _SKIN_COLOR = [0.80, 0.68, 0.60, 1.0]
 _LINE_COLOR = [0.72, 0.08, 0.10, 1.0]
 _INFLUENCES = 4
 """Joints that move a vertex: as many as every glTF reader takes."""
-_LINES = 1
-_VERTEX_DATA, _INDEX_DATA = 34962, 34963
-_COMPONENTS = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
-_MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
 
 
 def mesh_glb(vertices: Array, faces: Faces, measurements: Sequence[Measurement]) -> bytes:
@@ -44,8 +39,11 @@ def mesh_glb(vertices: Array, faces: Faces, measurements: Sequence[Measurement])
         path = np.concatenate([row.path, row.path[:1]]) if row.closed else row.path
         # Pairs of points, since not every reader knows strips and loops.
         pairs = np.repeat(path, 2, axis=0)[1:-1]
-        attributes = {"POSITION": file.positions(pairs)}
-        primitive = {"attributes": attributes, "mode": _LINES, "material": material}
+        primitive = gltf.Primitive(
+            attributes=gltf.Attributes(POSITION=file.positions(pairs)),
+            mode=gltf.LINES,
+            material=material,
+        )
         extras = {"value_m": round(row.value_m, 5), "standard": row.standard}
         mesh = file.mesh(row.name, primitive)
         lines.append(file.node(name=row.name, mesh=mesh, extras=extras))
@@ -62,73 +60,66 @@ def avatar_glb(model: BodyModel, vertices: Array, state: BodyState) -> bytes:
     file = _File()
     joints = joint_positions(model, vertices, state.rotations)
     skin = file.add_skin(model, joints, state)
-    strongest, weights = file.influences(model.vertex_weights)
-    mesh = file.body(vertices, model.faces, {"JOINTS_0": strongest, "WEIGHTS_0": weights})
+    attributes = gltf.Attributes()
+    attributes.JOINTS_0, attributes.WEIGHTS_0 = file.influences(model.vertex_weights)
+    mesh = file.body(vertices, model.faces, attributes)
     body = file.node(name="body", mesh=mesh, skin=0)
     file.scene("avatar", [skin, body])
     return file.content()
 
 
 class _File:
-    """A glTF file as it grows: arrays go into one buffer, each with its accessor.
-
-    Names of fields and numbers of kinds are those of Khronos' glTF 2.0 specification.
-    """
+    """A glTF file as it grows: arrays go into one buffer, each with its accessor."""
 
     def __init__(self) -> None:
-        self._lists: dict[str, list[dict[str, Any]]] = {}
+        self._gltf = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="body-booth"), scene=0)
         self._blob = bytearray()
 
     def content(self) -> bytes:
         """The whole file as GLB."""
-        document = {
-            "asset": {"version": "2.0", "generator": "body-booth"},
-            "scene": 0,
-            **self._lists,
-            "buffers": [{"byteLength": len(self._blob)}],
-        }
-        text = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
-        chunks = _chunk(_JSON, text, b" ") + _chunk(_BINARY, bytes(self._blob), b"\0")
-        return _MAGIC + _whole(2) + _whole(12 + len(chunks)) + chunks
-
-    def _add(self, kind: str, **fields: Any) -> int:
-        """Its index among those of its kind."""
-        items = self._lists.setdefault(kind, [])
-        items.append(fields)
-        return len(items) - 1
+        self._gltf.buffers = [gltf.Buffer(byteLength=len(self._blob))]
+        self._gltf.set_binary_blob(bytes(self._blob))
+        return b"".join(self._gltf.save_to_bytes())
 
     def scene(self, name: str, roots: list[int]) -> None:
-        self._add("scenes", name=name, nodes=roots)
+        self._gltf.scenes.append(gltf.Scene(name=name, nodes=roots))
 
-    def node(self, **fields: Any) -> int:
-        return self._add("nodes", **fields)
+    def node(self, **fields: object) -> int:
+        return _appended(self._gltf.nodes, gltf.Node(**fields))
 
-    def mesh(self, name: str, primitive: dict[str, Any]) -> int:
-        return self._add("meshes", name=name, primitives=[primitive])
+    def mesh(self, name: str, primitive: gltf.Primitive) -> int:
+        return _appended(self._gltf.meshes, gltf.Mesh(name=name, primitives=[primitive]))
 
     def material(self, name: str, color: list[float]) -> int:
-        surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.8}
-        return self._add("materials", name=name, pbrMetallicRoughness=surface)
+        surface = gltf.PbrMetallicRoughness(
+            baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8
+        )
+        return _appended(
+            self._gltf.materials,
+            gltf.Material(
+                name=name, pbrMetallicRoughness=surface, alphaMode=None, alphaCutoff=None
+            ),
+        )
 
-    def body(self, vertices: Array, faces: Faces, others: Mapping[str, int] | None = None) -> int:
-        """A mesh of a closed surface in the world frame; others are attributes that it also has."""
+    def body(self, vertices: Array, faces: Faces, attributes: gltf.Attributes | None = None) -> int:
+        """A mesh of a closed surface in the world frame."""
+        attributes = attributes or gltf.Attributes()
+        attributes.POSITION = self.positions(vertices)
         normals = vertex_normals(vertices, faces) @ _Y_UP_FROM_Z_UP.T
-        attributes = {
-            "POSITION": self.positions(vertices),
-            "NORMAL": self._array(normals.astype(np.float32), "VEC3", _VERTEX_DATA),
-            **(others or {}),
-        }
+        attributes.NORMAL = self._array(normals.astype(np.float32), gltf.VEC3, gltf.ARRAY_BUFFER)
         corners = faces.ravel().astype(np.uint32 if len(vertices) >= 0xFFFF else np.uint16)
-        indices = self._array(corners, "SCALAR", _INDEX_DATA)
+        indices = self._array(corners, gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER)
         material = self.material("skin", _SKIN_COLOR)
-        primitive = {"attributes": attributes, "indices": indices, "material": material}
+        primitive = gltf.Primitive(attributes=attributes, indices=indices, material=material)
         return self.mesh("body", primitive)
 
     def positions(self, points: Array) -> int:
         """Points of the z-up world."""
         found = (points @ _Y_UP_FROM_Z_UP.T).astype(np.float32)
-        low, high = found.min(axis=0).tolist(), found.max(axis=0).tolist()
-        return self._array(found, "VEC3", _VERTEX_DATA, min=low, max=high)
+        accessor = self._array(found, gltf.VEC3, gltf.ARRAY_BUFFER)
+        self._gltf.accessors[accessor].min = found.min(axis=0).tolist()
+        self._gltf.accessors[accessor].max = found.max(axis=0).tolist()
+        return accessor
 
     def influences(self, weights: Array) -> tuple[int, int]:
         """Each vertex' strongest joints and their weights, which add up to 1."""
@@ -137,8 +128,8 @@ class _File:
         kept = (kept / kept.sum(axis=1, keepdims=True)).astype(np.float32)
         strongest = np.where(kept > 0.0, strongest, 0).astype(np.uint8)
         return (
-            self._array(strongest, "VEC4", _VERTEX_DATA),
-            self._array(kept, "VEC4", _VERTEX_DATA),
+            self._array(strongest, gltf.VEC4, gltf.ARRAY_BUFFER),
+            self._array(kept, gltf.VEC4, gltf.ARRAY_BUFFER),
         )
 
     def add_skin(self, model: BodyModel, joints: Array, state: BodyState) -> int:
@@ -163,44 +154,44 @@ class _File:
                 )
             )
             if parent >= 0:
-                above = self._lists["nodes"][nodes[parent]]
-                above.setdefault("children", []).append(nodes[part])
+                self._gltf.nodes[nodes[parent]].children.append(nodes[part])
         matrices = np.swapaxes(inverse, 1, 2).reshape(-1, 16).astype(np.float32)
-        self._add(
-            "skins",
+        skin = gltf.Skin(
             name="skeleton",
             joints=nodes,
             skeleton=nodes[0],
-            inverseBindMatrices=self._array(matrices, "MAT4"),
+            inverseBindMatrices=self._array(matrices, gltf.MAT4),
         )
+        self._gltf.skins.append(skin)
         return nodes[0]
 
-    def _array(
-        self, array: NDArray[np.generic], kind: str, target: int | None = None, **fields: Any
-    ) -> int:
+    def _array(self, array: NDArray[np.generic], kind: str, target: int | None = None) -> int:
         data = np.ascontiguousarray(array).tobytes()
         self._blob += bytes(-len(self._blob) % 4)
-        view: dict[str, int] = {} if target is None else {"target": target}
-        view |= {"buffer": 0, "byteOffset": len(self._blob), "byteLength": len(data)}
+        view = gltf.BufferView(
+            buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target
+        )
         self._blob += data
-        return self._add(
-            "accessors",
-            bufferView=self._add("bufferViews", **view),
+        accessor = gltf.Accessor(
+            bufferView=_appended(self._gltf.bufferViews, view),
             componentType=_COMPONENTS[array.dtype.name],
             count=len(array),
             type=kind,
-            **fields,
         )
+        return _appended(self._gltf.accessors, accessor)
 
 
-def _chunk(kind: bytes, data: bytes, filler: bytes) -> bytes:
-    """A chunk of a GLB file, filled up to whole words."""
-    data += filler * (-len(data) % 4)
-    return _whole(len(data)) + kind + data
+_COMPONENTS = {
+    "float32": gltf.FLOAT,
+    "uint8": gltf.UNSIGNED_BYTE,
+    "uint16": gltf.UNSIGNED_SHORT,
+    "uint32": gltf.UNSIGNED_INT,
+}
 
 
-def _whole(number: int) -> bytes:
-    return number.to_bytes(4, "little")
+def _appended(items: list[object], item: object) -> int:
+    items.append(item)
+    return len(items) - 1
 
 
 def _quaternion(twist: Array) -> Array:
