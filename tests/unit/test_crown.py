@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from station.depth import CameraView, PointCloud
-from station.depth.points import camera_points
+from station.depth.points import rays
 from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, default_rig, rod
 from station.geometry import rigid, so3_exp, transform
 from workers.scape.cameras import CameraCorrections
@@ -119,7 +119,7 @@ def test_a_corrected_camera_stands_where_its_points_are_moved_to(
     model: BodyModel, body: np.ndarray
 ) -> None:
     view = _view(model, body)
-    local = camera_points(UPPER, view.depth_m)[view.depth_m > 0].astype(np.float64)
+    local = (rays(UPPER) * view.depth_m[..., None])[view.depth_m > 0].astype(np.float64)
     points = transform(POSE, local)
     camera = np.zeros(len(points), np.int16)
     cloud = PointCloud(points, points, np.ones(len(points)), camera, ("front-upper",))
