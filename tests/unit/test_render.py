@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import open3d as o3d
 import pytest
 
+from station.geometry import so3_exp
 from workers.export.preview import _spread, preview
 from workers.measure.body import Measurement, measure_body
 from workers.render import BACKGROUND, Frame, Scene
@@ -105,3 +108,12 @@ def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]
 def test_a_row_that_is_not_measured_is_left_out(model: BodyModel, rows: list[Measurement]) -> None:
     some = [row for row in rows if row.name != "waist_girth"]
     assert len(preview(model.mean, model.faces, some, OK)) > 1000
+
+
+def test_the_front_is_the_persons(model: BodyModel, rows: list[Measurement]) -> None:
+    """Whichever way they stood."""
+    turn = so3_exp(np.array([0.0, 0.0, 2.0]))
+    turned = [replace(row, path=row.path @ turn.T) for row in rows]
+    ahead = _decoded(preview(model.mean, model.faces, rows, OK))
+    away = _decoded(preview(model.mean @ turn.T, model.faces, turned, OK, 2.0))
+    assert np.mean(np.abs(ahead.astype(float) - away) > 8.0) < 0.01

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from station.geometry import so3_exp
 from workers.measure.body import Measurement
 from workers.render import (
     BACKGROUND,
@@ -65,9 +67,12 @@ def preview(
     faces: NDArray[np.int32],
     measurements: Sequence[Measurement],
     verdict: Verdict,
+    heading_rad: float = 0.0,
 ) -> bytes:
-    """The picture as PNG."""
-    by_name = {measurement.name: measurement for measurement in measurements}
+    """The picture as PNG, of a body that faces so far about z from -y."""
+    turn = so3_exp(np.array([0.0, 0.0, heading_rad]))
+    vertices = vertices @ turn
+    by_name = {row.name: replace(row, path=row.path @ turn) for row in measurements}
     frames = [_frame(vertices, view) for view in _SHOWN]
     with ThreadPoolExecutor(2) as pool:
         renderings = list(pool.map(Scene(vertices, faces).render, frames))

@@ -48,7 +48,11 @@ def write_result(
         faces = model.faces
         # Drawing leaves the interpreter's lock alone: it goes on beside the other files.
         with ThreadPoolExecutor(1) as beside:
-            picture = beside.submit(preview, fit.vertices, faces, measured.rows, fit.verdict)
+            forward = -fit.state.rotations[0][:, 1]
+            heading_rad = float(np.arctan2(forward[0], -forward[1]))
+            picture = beside.submit(
+                preview, fit.vertices, faces, measured.rows, fit.verdict, heading_rad
+            )
             files = {
                 "mesh.ply": ply_mesh(fit.vertices, faces),
                 "mesh.obj": obj_mesh(fit.vertices, model),
