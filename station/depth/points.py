@@ -99,25 +99,28 @@ def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:
 def normals(points: Image, depth_m: Image) -> tuple[Image, NDArray[np.bool_]]:
     """Unit normals (h, w, 3) towards the camera, and where they exist.
 
-    From central differences over a few pixels that lie on one surface.
+    From central differences over a few pixels that lie on one surface. Where only the reading above
+    is missing the difference is one-sided: the projector's shadow lies along the rows, so that
+    there the surface turns away, as the crown of a head does.
     """
     r = _NORMAL_REACH_PX
     result = np.zeros_like(points)
-    right, left = points[r:-r, 2 * r :], points[r:-r, : -2 * r]
-    below, above = points[2 * r :, r:-r], points[: -2 * r, r:-r]
-    inner = cross(below - above, right - left)
+    middle = np.s_[r:-r, r:-r]
+    right, left = np.s_[r:-r, 2 * r :], np.s_[r:-r, : -2 * r]
+    below, above = np.s_[2 * r :, r:-r], np.s_[: -2 * r, r:-r]
+    ends = depth_m[above] == 0
+    high = np.where(ends[..., None], points[middle], points[above])
+    inner = cross(points[below] - high, points[right] - points[left])
     length = np.sqrt(np.einsum("hwi,hwi->hw", inner, inner))
-    center = depth_m[r:-r, r:-r]
-    whole = center > 0
-    for neighbour in (
-        depth_m[r:-r, 2 * r :], depth_m[r:-r, : -2 * r],
-        depth_m[2 * r :, r:-r], depth_m[: -2 * r, r:-r],
-    ):  # fmt: skip
-        whole &= (neighbour > 0) & (np.abs(neighbour - center) < _JUMP_RATIO * r * center)
-    whole &= length > 0
-    result[r:-r, r:-r] = np.where(whole[..., None], inner / np.maximum(length, 1e-12)[..., None], 0)
+    center = depth_m[middle]
+    whole = (center > 0) & (length > 0)
+    for side, none in ((right, False), (left, False), (below, False), (above, ends)):
+        neighbour = depth_m[side]
+        near = (neighbour > 0) & (np.abs(neighbour - center) < _JUMP_RATIO * r * center)
+        whole &= near | none
+    result[middle] = np.where(whole[..., None], inner / np.maximum(length, 1e-12)[..., None], 0)
     valid = np.zeros(depth_m.shape, bool)
-    valid[r:-r, r:-r] = whole
+    valid[middle] = whole
     facing = np.einsum("hwi,hwi->hw", result, points) > 0
     result[facing] *= -1.0
     return result, valid
