@@ -94,7 +94,9 @@ def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:
 def normals(points: Image, depth_m: Image) -> tuple[Image, NDArray[np.bool_]]:
     """Unit normals (h, w, 3) towards the camera, and where they exist.
 
-    From central differences over a few pixels that lie on one surface.
+    From central differences over a few pixels that lie on one surface. Where only the reading above
+    is missing the difference is one-sided: the projector's shadow lies along the rows, so that
+    there the surface turns away, as the crown of a head does.
     """
     return _normals(points, depth_m, _NORMAL_REACH_PX, np.float32(_JUMP_RATIO * _NORMAL_REACH_PX))
 
@@ -106,15 +108,16 @@ def _normals(points, depth_m, reach, jump):  # type: ignore[no-untyped-def]  # p
     for v in range(reach, height - reach):
         for u in range(reach, width - reach):
             gate = jump * depth_m[v, u]
+            ends = depth_m[v - reach, u] == 0.0
             if not (
                 _near(depth_m[v, u + reach], depth_m[v, u], gate)
                 and _near(depth_m[v, u - reach], depth_m[v, u], gate)
                 and _near(depth_m[v + reach, u], depth_m[v, u], gate)
-                and _near(depth_m[v - reach, u], depth_m[v, u], gate)
+                and (ends or _near(depth_m[v - reach, u], depth_m[v, u], gate))
             ):
                 continue
             right, left = points[v, u + reach], points[v, u - reach]
-            below, above = points[v + reach, u], points[v - reach, u]
+            below, above = points[v + reach, u], points[v if ends else v - reach, u]
             a, b, c = below[0] - above[0], below[1] - above[1], below[2] - above[2]
             d, e, f = right[0] - left[0], right[1] - left[1], right[2] - left[2]
             x, y, z = b * f - c * e, c * d - a * f, a * e - b * d

@@ -120,6 +120,26 @@ def test_normals_face_the_camera() -> None:
     assert np.allclose(directions[240, 320], (0, 0, -1), atol=1e-3)
 
 
+def test_normals_reach_up_to_where_a_surface_ends() -> None:
+    """A plane at 60 degrees; above it nothing, beside it a shadow, below it another surface that
+    ends below."""
+    camera = default_rig().cameras["front-upper"]
+    ray = rays(camera)
+    normal = np.array([0.0, -np.sin(np.radians(60.0)), -np.cos(np.radians(60.0))])
+    depth = (-0.75 / (ray @ normal)).astype(np.float32)
+    depth[280:] += 0.2
+    depth[:200] = 0.0
+    depth[360:] = 0.0
+    depth[:, :300] = 0.0
+    directions, valid = normals(ray * depth[..., None], depth)
+    assert valid[200:278, 302:400].all()
+    assert not valid[:200].any()
+    assert not valid[:, :302].any()
+    assert not valid[278:282].any()
+    assert not valid[358:].any()
+    assert np.allclose(directions[200:278, 302:400], normal, atol=2e-3)
+
+
 def test_a_person_who_moved_is_reported_in_millimetres(tmp_path: Path) -> None:
     body = load_mesh(BODIES / "ann.npz")
     booth = SimulatedBooth(seed=1, sway_m=0.0)
