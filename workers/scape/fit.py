@@ -31,6 +31,7 @@ from workers.scape.joint import (
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
+from workers.scape.rims import Rims
 from workers.scape.sampling import Sampling
 from workers.scape.surface import fit_surface
 from workers.scape.verdict import (
@@ -196,10 +197,13 @@ def _best_start(
             break
     assert best is not None
     done, steps = 0, len(MIDDLE) + len(FINE)
+    hands = sampling.hands
     for schedule in (MIDDLE, FINE):
         share = len(schedule) / steps
+        bodies = [best.vertices[np.isin(model.part_of_vertex, hand.parts)] for hand in hands]
+        target = replace(target, rims=Rims.build(views, cloud.camera_names, bodies))
         normals = vertex_normals(best.vertices, model.faces)
-        state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
+        state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)
         best = fit_jointly(
             model,
             sampling,

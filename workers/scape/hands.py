@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree
 from workers.scape.kernels import trimmed_costs
-from workers.scape.model import BodyModel, BodyState
+from workers.scape.model import HAND, BodyModel, BodyState
 from workers.scape.sampled import SampledBody
 from workers.scape.spread import farthest_first
 
@@ -62,7 +62,7 @@ def hands_of(model: BodyModel) -> tuple[Hand, ...]:
 
 def _hand(model: BodyModel, side: str) -> Hand:
     names = model.part_names
-    parts = tuple(names.index(f"{part}_{side}") for part in ("hand", "thumb", "fingers"))
+    parts = tuple(names.index(f"{part}_{side}") for part in HAND)
     mine = np.flatnonzero(np.isin(model.part_of_vertex, parts))
     order = farthest_first(model.mean[mine], _SAMPLES)
     columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])

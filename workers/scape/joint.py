@@ -23,6 +23,7 @@ from workers.scape.correspondence import Followers, OrientedTree
 from workers.scape.free_space import FreeSpace
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
+from workers.scape.rims import Rims
 from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
 from workers.scape.sampled import twist_chain
 from workers.scape.sampling import COARSE_SAMPLES, FINE_SAMPLES, Sampling
@@ -37,6 +38,12 @@ _THUMB_STIFFNESS = 3.0
 _PULLED_POINTS = 10_000
 _COARSELY_PULLED = 4
 """While the fit is coarse, every so many of them."""
+_ASIDE = 2.0
+"""A point is as far away as it lies ahead of a vertex, or at most so many times as far."""
+_SPACING_M = 0.002
+"""Points next to each other lie so far apart."""
+_RIM_M = 0.02
+"""Beyond it a rim is another finger's."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -88,6 +95,8 @@ class Target:
     free_space: FreeSpace
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
+    rims: Rims
+    """Of the hands, once it is known where they are."""
 
     @classmethod
     def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
@@ -102,6 +111,7 @@ class Target:
             OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
             cloud.camera[used].astype(np.intp),
+            Rims.joined(),
         )
 
 
@@ -135,16 +145,17 @@ def fit_jointly(
     prior = _TwistPrior.build(model)
     pulled = target.pulled
     followers = Followers(model.neighbours, target.tree.points[pulled], target.tree.normals[pulled])
+    rimmed = Followers(model.neighbours, target.rims.points, target.rims.normals)
     terms: _DataTerms | None = None
     with ThreadPoolExecutor(max_workers=1) as beside:
         for step, stage in enumerate(schedule):
             skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
             # What the correspondences need not wait for is done beside them.
-            probed = beside.submit(_probed, target, skin, stage)
+            probed = beside.submit(_probed, model, target, skin, stage)
             derivative = beside.submit(
                 sampling.body.first(stage.samples).jacobian, state, stage.components
             )
-            terms = _data_terms(model, target, followers, probed, cameras, skin, stage)
+            terms = _data_terms(model, target, followers, rimmed, probed, cameras, skin, stage)
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
@@ -168,18 +179,38 @@ class _DataTerms:
     """(m, 3): the other."""
 
 
-def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _probed(
+    model: BodyModel, target: Target, skin: Skin, stage: Stage
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Even places of the skin that have a point, and which."""
     cloud = target.coarse if stage.coarse else target.tree
     probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
     probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **stage.limits)
-    return probes[probing], target.pulled[found] if stage.coarse else found
+    place = probes[probing]
+    if stage.coarse:
+        return place, target.pulled[found]
+    kept = ~np.isin(skin.part[place], model.hand_parts)
+    kept |= _before(skin.positions[place], skin.normals[place], cloud.points[found])
+    return place[kept], found[kept]
+
+
+def _before(places: Array, normals: Array, points: Array) -> NDArray[np.bool_]:
+    """Whether points (n, 3) lie before or behind oriented places (n, 3) rather than beside them.
+
+    The tip of a finger gives no reading: what is nearest to it is the cloud's border, and would
+    draw it back (pairs at a mesh's border are left out since Turk & Levoy 1994).
+    """
+    offset = points - places
+    away = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+    ahead = np.abs(np.einsum("ni,ni->n", offset, normals))
+    return np.asarray(away < _ASIDE * ahead + _SPACING_M)
 
 
 def _data_terms(
     model: BodyModel,
     target: Target,
     followers: Followers,
+    rimmed: Followers,
     probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
     cameras: CameraCorrections,
     skin: Skin,
@@ -201,14 +232,12 @@ def _data_terms(
     on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
     direction = skin.normals[place]
-    residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
-    variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
-    robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    pairs = Rows(place, direction, residual, stage.row_share * robust / variance)
+    pairs = _pulled(place, direction, on_cloud - on_body, target.sigma_m[point], stage)
     rows = [pairs, floor_rows(model, skin, max(0.012, 0.5 * stage.gate_m))]
     camera_terms = None
     if not stage.coarse:
         rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
+        rows.append(_rim_rows(model, target.rims, rimmed, cameras, skin, stage))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(
@@ -216,6 +245,34 @@ def _data_terms(
             )
     weight, pull = Rows.joined(*rows).at_samples(skin, stage.samples)
     return _DataTerms(weight, pull, camera_terms, on_body, on_cloud)
+
+
+def _rim_rows(
+    model: BodyModel,
+    rims: Rims,
+    rimmed: Followers,
+    cameras: CameraCorrections,
+    skin: Skin,
+    stage: Stage,
+) -> Rows:
+    """Hands end where cameras saw them end before the booth."""
+    seen, place = rimmed.pairs(
+        skin.positions, skin.normals, max_distance_m=_RIM_M, max_angle_rad=stage.angle_rad
+    )
+    own = np.isin(skin.part[place], model.hand_parts)
+    seen, place = seen[own], place[own]
+    offset = cameras.moved(rims.points[seen], rims.camera[seen]) - skin.positions[place]
+    return _pulled(place, rims.normals[seen], offset, rims.sigma_m[seen], stage)
+
+
+def _pulled(
+    place: NDArray[np.intp], direction: Array, offset: Array, sigma_m: Array, stage: Stage
+) -> Rows:
+    """Places of the skin that go by an offset (n, 3) as far as it is along a direction (n, 3)."""
+    residual = np.einsum("ni,ni->n", direction, offset)
+    robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
+    variance = sigma_m**2 + _MODEL_SIGMA_M**2
+    return Rows(place, direction, residual, stage.row_share * robust / variance)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from station.depth import Finding, PointCloud
 from workers.scape.correspondence import OrientedTree
 from workers.scape.deformation import vertex_areas, vertex_normals
-from workers.scape.model import BodyModel
+from workers.scape.model import HAND, BodyModel
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,6 @@ _TRUNK = ("pelvis", "abdomen", "chest")
 _SIDES = {"front": -1.0, "back": 1.0}
 """Of a person on the mark, who faces -y."""
 _FACING = 0.7
-_HAND = ("hand", "thumb", "fingers")
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
 
@@ -125,7 +124,7 @@ def _groups(model: BodyModel) -> dict[str, list[int]]:
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(model.part_names):
         stem, _, side = name.rpartition("_")
-        key = f"hand_{side}" if stem in _HAND else name
+        key = f"hand_{side}" if stem in HAND else name
         groups.setdefault(key, []).append(index)
     return groups
 
