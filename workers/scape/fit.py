@@ -38,6 +38,7 @@ from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,
     PartReport,
     Verdict,
+    hands_sunk,
     judge,
     report_parts,
     sides_seen,
@@ -147,7 +148,8 @@ def _fit(
     shifts = cameras.shifts_m(scan.cloud)
     stature_m = float(np.ptp(surface.vertices[:, 2]))
     sides = sides_seen(model, surface.vertices, surface.seen)
-    verdict = judge(parts, sides, scan.findings, unexplained, stature_m, state.beta, shifts)
+    sunk = hands_sunk(model, overlapping)
+    verdict = judge(parts, sides, sunk, scan.findings, unexplained, stature_m, state.beta, shifts)
     # Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does not:
     # the same scan gives the same file.
     delivered = np.round(surface.vertices, 7)
