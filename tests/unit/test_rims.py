@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from station.depth import CameraView
+from station.depth import CameraView, PointCloud
 from station.depth.points import project
 from station.drivers.virtual_scene import default_rig
 from station.geometry import invert, transform
-from workers.scape.rims import Rims
+from workers.scape.rims import rims_of
 
 FINGER_M, WALL_M = 1.6, 3.0
 ROWS, COLUMNS = slice(200, 240), slice(318, 323)
@@ -29,13 +29,13 @@ def _finger() -> np.ndarray:
     return depth
 
 
-def _rims(depth_m: np.ndarray) -> tuple[Rims, np.ndarray]:
+def _rims(depth_m: np.ndarray) -> tuple[PointCloud, np.ndarray]:
     """Rims around where the finger is thought to be, 4 px short of its tip, and their pixels."""
     view = _seen(depth_m)
     K, pose = view.calibration.K, view.calibration.world_from_camera
     pixels = np.array([(u, v) for u in (319, 322) for v in (200, 235)], float)
     local = np.column_stack([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones(4)]) * FINGER_M
-    rims = Rims.build([view], ["another", view.name], [transform(pose, local)])
+    rims = rims_of([view], ("another", view.name), [transform(pose, local)])
     return rims, project(view.calibration, transform(invert(pose), rims.points))
 
 
@@ -80,5 +80,5 @@ def test_what_gives_no_reading_is_not_an_end() -> None:
 
 
 def test_nobody_has_no_rims() -> None:
-    assert not len(Rims.build([], [], []).points)
-    assert not len(_rims(np.full_like(_finger(), WALL_M))[0].points)
+    assert not len(rims_of([], (), []))
+    assert not len(_rims(np.full_like(_finger(), WALL_M))[0])

@@ -31,7 +31,7 @@ from workers.scape.joint import (
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
-from workers.scape.rims import Rims
+from workers.scape.rims import rims_of
 from workers.scape.sampling import Sampling
 from workers.scape.surface import fit_surface
 from workers.scape.verdict import (
@@ -138,7 +138,7 @@ def _fit(
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
-        surface = fit_surface(model, joint.vertices, cloud)
+        surface = fit_surface(model, joint.vertices, cloud, cameras.corrected(joint.rims))
         overlapping = surface.vertices
         free = untangled(model, overlapping, joint.vertices)
         surface = replace(surface, vertices=free)
@@ -203,7 +203,7 @@ def _best_start(
     for schedule in (MIDDLE, FINE):
         share = len(schedule) / steps
         bodies = [best.vertices[np.isin(model.part_of_vertex, hand.parts)] for hand in hands]
-        target = replace(target, rims=Rims.build(views, cloud.camera_names, bodies))
+        target = replace(target, rims=rims_of(views, cloud.camera_names, bodies))
         normals = vertex_normals(best.vertices, model.faces)
         state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)
         best = fit_jointly(

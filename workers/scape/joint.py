@@ -23,7 +23,7 @@ from workers.scape.correspondence import Followers, OrientedTree
 from workers.scape.free_space import FreeSpace
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
-from workers.scape.rims import Rims
+from workers.scape.rims import rims_of
 from workers.scape.rows import CameraTerms, Rows, Skin, floor_rows, outline_rows
 from workers.scape.sampled import twist_chain
 from workers.scape.sampling import COARSE_SAMPLES, FINE_SAMPLES, Sampling
@@ -42,8 +42,6 @@ _ASIDE = 2.0
 """A point is as far away as it lies ahead of a vertex, or at most so many times as far."""
 _SPACING_M = 0.002
 """Points next to each other lie so far apart."""
-_RIM_M = 0.02
-"""Beyond it a rim is another finger's."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -95,7 +93,7 @@ class Target:
     free_space: FreeSpace
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
-    rims: Rims
+    rims: PointCloud
     """Of the hands, once it is known where they are."""
 
     @classmethod
@@ -111,7 +109,7 @@ class Target:
             OrientedTree.build(points[pulled], normals[pulled]),
             FreeSpace.build(views),
             cloud.camera[used].astype(np.intp),
-            Rims.joined(),
+            rims_of((), cloud.camera_names, ()),
         )
 
 
@@ -127,6 +125,8 @@ class JointResult:
     state: BodyState
     cameras: CameraCorrections
     vertices: Array
+    rims: PointCloud
+    """Of the hands, as the target had them."""
     correspondences: int
     iterations: int
 
@@ -162,7 +162,9 @@ def fit_jointly(
             state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
             progress((step + 1) / len(schedule))
     assert terms is not None
-    return JointResult(state, cameras, model.vertices(state), len(terms.on_body), len(schedule))
+    return JointResult(
+        state, cameras, model.vertices(state), target.rims, len(terms.on_body), len(schedule)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +239,7 @@ def _data_terms(
     camera_terms = None
     if not stage.coarse:
         rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
-        rows.append(_rim_rows(model, target.rims, rimmed, cameras, skin, stage))
+        rows.append(_rim_rows(target.rims, rimmed, cameras, skin, stage))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(
@@ -248,19 +250,10 @@ def _data_terms(
 
 
 def _rim_rows(
-    model: BodyModel,
-    rims: Rims,
-    rimmed: Followers,
-    cameras: CameraCorrections,
-    skin: Skin,
-    stage: Stage,
+    rims: PointCloud, rimmed: Followers, cameras: CameraCorrections, skin: Skin, stage: Stage
 ) -> Rows:
     """Hands end where cameras saw them end before the booth."""
-    seen, place = rimmed.pairs(
-        skin.positions, skin.normals, max_distance_m=_RIM_M, max_angle_rad=stage.angle_rad
-    )
-    own = np.isin(skin.part[place], model.hand_parts)
-    seen, place = seen[own], place[own]
+    seen, place = rimmed.pairs(skin.positions, skin.normals, **stage.limits)
     offset = cameras.moved(rims.points[seen], rims.camera[seen]) - skin.positions[place]
     return _pulled(place, rims.normals[seen], offset, rims.sigma_m[seen], stage)
 

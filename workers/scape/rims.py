@@ -9,14 +9,13 @@ Blake 1992). A place and a normal are all that the fit needs to know of a point.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.rig import CameraCalibration
-from station.depth import CameraView
+from station.depth import CameraView, PointCloud
 from station.depth.points import project, rays
 from station.geometry import invert, transform
 
@@ -37,52 +36,30 @@ _LATERAL_PX = 0.8
 """Standard deviation of an edge in the image (Nguyen, Izadi & Lovell 2012)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rims:
-    """Oriented points (n, 3) of the skin where it turns away from a camera."""
+def rims_of(
+    views: Sequence[CameraView], camera_names: tuple[str, ...], bodies: Sequence[Array]
+) -> PointCloud:
+    """In all views, of bodies of which vertices (m, 3) are known by a few centimetres.
 
-    points: Array
-    normals: Array
-    """Outwards, square to the rays."""
-    sigma_m: Array
-    """(n,): standard deviation along the normals."""
-    camera: NDArray[np.intp]
-    """(n,): whose points they are."""
-
-    @classmethod
-    def joined(cls, *rims: Rims) -> Rims:
-        """One after the other; none at all have no points."""
-        return cls(
-            np.concatenate([np.empty((0, 3)), *(one.points for one in rims)]),
-            np.concatenate([np.empty((0, 3)), *(one.normals for one in rims)]),
-            np.concatenate([np.empty(0), *(one.sigma_m for one in rims)]),
-            np.concatenate([np.empty(0, np.intp), *(one.camera for one in rims)]),
-        )
-
-    @classmethod
-    def build(
-        cls, views: Sequence[CameraView], camera_names: Sequence[str], bodies: Sequence[Array]
-    ) -> Rims:
-        """In all views, of bodies of which vertices (m, 3) are known by a few centimetres.
-
-        Args:
-            camera_names: a view's camera is the index of its name.
-        """
-        return cls.joined(
-            *(
-                _rim(view, camera_names.index(view.name), vertices)
-                for view in views
-                for vertices in bodies
-            )
-        )
+    The normals look outwards, square to the rays; sigma_m is that along them.
+    """
+    nothing = np.empty((0, 3))
+    rims, cameras = [(nothing, nothing, np.empty(0))], [0]
+    for view in views:
+        for vertices in bodies:
+            rims.append(_rim(view, vertices))
+            cameras.append(camera_names.index(view.name))
+    points, normals, sigma_m = (np.concatenate(pieces) for pieces in zip(*rims, strict=True))
+    camera = np.repeat(np.array(cameras, np.int16), [len(points) for points, _, _ in rims])
+    return PointCloud(points, normals, sigma_m, camera, camera_names)
 
 
-def _rim(view: CameraView, camera: int, vertices: Array) -> Rims:
-    calibration = view.calibration
-    local = transform(invert(calibration.world_from_camera), vertices)
+def _rim(view: CameraView, vertices: Array) -> tuple[Array, Array, Array]:
+    """Points (n, 3), normals (n, 3) and standard deviations (n,) in one view."""
+    local = transform(invert(view.calibration.world_from_camera), vertices)
     corner, depth = _window(view, local)
     if not depth.size:
-        return Rims.joined()
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     nearest, farthest = local[:, 2].min() - _AROUND_M, local[:, 2].max() + _AROUND_M
     # What is nearer than the body hides its rim: it counts as inside, and its own rim is left out.
     inside = ((depth > 0) & (depth < farthest)).astype(np.uint8)
@@ -94,7 +71,7 @@ def _rim(view: CameraView, camera: int, vertices: Array) -> Rims:
     y, x = np.nonzero(edge & (np.hypot(slope_u, slope_v) > _LEAST_SLOPE))
     outwards = -np.stack([slope_u[y, x], slope_v[y, x]], axis=1).astype(np.float64)
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-    return _lifted(calibration, camera, (x, y) + corner[:, None], outwards, depth[y, x])
+    return _lifted(view.calibration, (x, y) + corner[:, None], outwards, depth[y, x])
 
 
 def _square(reach_px: int) -> NDArray[np.uint8]:
@@ -115,11 +92,10 @@ def _window(view: CameraView, local: Array) -> tuple[NDArray[np.intp], NDArray[n
 
 def _lifted(
     calibration: CameraCalibration,
-    camera: int,
     pixels: NDArray[np.intp],
     outwards: Array,
     depth_m: NDArray[np.float32],
-) -> Rims:
+) -> tuple[Array, Array, Array]:
     """Edge pixels (2, n) and the outline's normals (n, 2) there as oriented points of the world."""
     focal = np.diag(calibration.K)[:2]
     ray = rays(calibration)[pixels[1], pixels[0]].astype(np.float64)
@@ -129,9 +105,8 @@ def _lifted(
     normals = np.column_stack([across, -np.einsum("ni,ni->n", across, ray[:, :2])])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     pose, z = calibration.world_from_camera, depth_m.astype(np.float64)
-    return Rims(
+    return (
         (ray * z[:, None]) @ pose[:3, :3].T + pose[:3, 3],
         normals @ pose[:3, :3].T,
         _LATERAL_PX * z / focal[0],
-        np.full(len(z), camera, np.intp),
     )

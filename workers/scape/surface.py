@@ -56,11 +56,15 @@ class SurfaceFit:
     """(P,): mean signed distance of its points after the fit; NaN where there are none."""
 
 
-def fit_surface(model: BodyModel, vertices: Array, cloud: PointCloud) -> SurfaceFit:
-    """Lay the model's surface (P, 3) on the cloud's points."""
+def fit_surface(
+    model: BodyModel, vertices: Array, cloud: PointCloud, rims: PointCloud
+) -> SurfaceFit:
+    """Lay the model's surface (P, 3) on the cloud's points, and on rims where the cloud ends."""
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    followers = Followers(model.neighbours, cloud.points[every], cloud.normals[every], dense=True)
-    noise = cloud.sigma_m[every]
+    points = np.concatenate([cloud.points[every], rims.points])
+    directions = np.concatenate([cloud.normals[every], rims.normals])
+    followers = Followers(model.neighbours, points, directions, dense=True)
+    noise = np.concatenate([cloud.sigma_m[every], rims.sigma_m])
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
