@@ -30,10 +30,12 @@ _FOREIGN_M = 0.025
 _CUT_M = 0.03
 _DIRECTION_SCALE_M = 0.02
 _MODEL_SHARE = 0.5
-_PRIOR_M = 2.5e-4
+_PRIOR_M = 1e-4
 """What one squared standard deviation off the prior costs, in metres of mean distance."""
 _ROUNDS = (96, 64, 48, 32)
 _ELITE = 8
+_CURL = 2.0
+"""What varies most is how far the fingers are closed: people make fists, poses hardly do."""
 _SPREAD = 1.25
 """Standard deviations of the prior that the first round spans."""
 
@@ -67,6 +69,7 @@ def _hand(model: BodyModel, side: str) -> Hand:
     order = farthest_first(model.mean[mine], _SAMPLES)
     columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])
     values, vectors = np.linalg.eigh(model.twist_covariance[np.ix_(columns, columns)])
+    values[-1] *= _CURL**2
     body = model.at(mine[order])
     return Hand(
         side=side,
