@@ -54,6 +54,8 @@ _TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
 _MOST_STARTS = 4
+_RIM_EVERY = 8
+"""So many of a hand's vertices say about where it is."""
 _EXPLAINED = 0.008
 
 
@@ -202,7 +204,8 @@ def _best_start(
     hands = sampling.hands
     for schedule in (MIDDLE, FINE):
         share = len(schedule) / steps
-        bodies = [best.vertices[np.isin(model.part_of_vertex, hand.parts)] for hand in hands]
+        parts, places = model.part_of_vertex[::_RIM_EVERY], best.vertices[::_RIM_EVERY]
+        bodies = [places[np.isin(parts, hand.parts)] for hand in hands]
         target = replace(target, rims=rims_of(views, cloud.camera_names, bodies))
         normals = vertex_normals(best.vertices, model.faces)
         state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)

@@ -144,8 +144,11 @@ def fit_jointly(
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
     pulled = target.pulled
-    followers = Followers(model.neighbours, target.tree.points[pulled], target.tree.normals[pulled])
-    rimmed = Followers(model.neighbours, target.rims.points, target.rims.normals)
+    followers = Followers(
+        model.neighbours,
+        np.concatenate([target.tree.points[pulled], target.rims.points]),
+        np.concatenate([target.tree.normals[pulled], target.rims.normals]),
+    )
     terms: _DataTerms | None = None
     with ThreadPoolExecutor(max_workers=1) as beside:
         for step, stage in enumerate(schedule):
@@ -155,7 +158,7 @@ def fit_jointly(
             derivative = beside.submit(
                 sampling.body.first(stage.samples).jacobian, state, stage.components
             )
-            terms = _data_terms(model, target, followers, rimmed, probed, cameras, skin, stage)
+            terms = _data_terms(model, target, followers, probed, cameras, skin, stage)
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
@@ -212,7 +215,6 @@ def _data_terms(
     model: BodyModel,
     target: Target,
     followers: Followers,
-    rimmed: Followers,
     probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
     cameras: CameraCorrections,
     skin: Skin,
@@ -228,6 +230,10 @@ def _data_terms(
     else:
         pulled = target.pulled
         asking, mine = followers.pairs(skin.positions, skin.normals, **stage.limits)
+        # The rims come after the points.
+        border = int(np.searchsorted(asking, len(pulled)))
+        rimmed, at_rims = asking[border:] - len(pulled), mine[border:]
+        asking, mine = asking[:border], mine[:border]
     probes, found = probed.result()
     place = np.concatenate([mine, probes])
     point = np.concatenate([pulled[asking], found])
@@ -239,7 +245,7 @@ def _data_terms(
     camera_terms = None
     if not stage.coarse:
         rows.append(outline_rows(model, target.free_space, skin, stage.row_share))
-        rows.append(_rim_rows(target.rims, rimmed, cameras, skin, stage))
+        rows.append(_rim_rows(target.rims, rimmed, cameras, skin, at_rims, stage))
         if len(cameras):
             derivative = cameras.derivative(on_cloud, camera, direction)
             camera_terms = CameraTerms.build(
@@ -250,12 +256,16 @@ def _data_terms(
 
 
 def _rim_rows(
-    rims: PointCloud, rimmed: Followers, cameras: CameraCorrections, skin: Skin, stage: Stage
+    rims: PointCloud,
+    rimmed: NDArray[np.intp],
+    cameras: CameraCorrections,
+    skin: Skin,
+    place: NDArray[np.intp],
+    stage: Stage,
 ) -> Rows:
-    """Hands end where cameras saw them end before the booth."""
-    seen, place = rimmed.pairs(skin.positions, skin.normals, **stage.limits)
-    offset = cameras.moved(rims.points[seen], rims.camera[seen]) - skin.positions[place]
-    return _pulled(place, rims.normals[seen], offset, rims.sigma_m[seen], stage)
+    """Places of hands end where cameras saw them end before the booth."""
+    offset = cameras.moved(rims.points[rimmed], rims.camera[rimmed]) - skin.positions[place]
+    return _pulled(place, rims.normals[rimmed], offset, rims.sigma_m[rimmed], stage)
 
 
 def _pulled(

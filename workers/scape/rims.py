@@ -68,9 +68,11 @@ def _rim(view: CameraView, vertices: Array) -> tuple[Array, Array, Array]:
     smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _SMOOTH_PX)
     slope_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
     slope_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
-    y, x = np.nonzero(edge & (np.hypot(slope_u, slope_v) > _LEAST_SLOPE))
+    y, x = np.nonzero(edge)
     outwards = -np.stack([slope_u[y, x], slope_v[y, x]], axis=1).astype(np.float64)
-    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    steep = np.linalg.norm(outwards, axis=1)
+    kept = steep > _LEAST_SLOPE
+    y, x, outwards = y[kept], x[kept], outwards[kept] / steep[kept, None]
     return _lifted(view.calibration, (x, y) + corner[:, None], outwards, depth[y, x])
 
 
