@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -33,12 +33,14 @@ from workers.scape.joint import (
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
+from workers.scape.rims import rims_of
 from workers.scape.sampling import Sampling
 from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,
     PartReport,
     Verdict,
+    hands_sunk,
     judge,
     report_parts,
     sides_seen,
@@ -56,6 +58,8 @@ _SCOUT_SAMPLES = 250
 _FACING_POINTS = 6000
 """Enough to tell where the toes are."""
 _MOST_STARTS = 4
+_RIM_EVERY = 8
+"""So many of a hand's vertices say about where it is."""
 _EXPLAINED = 0.008
 
 
@@ -169,7 +173,7 @@ def lay_body(
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         crown = partial(reach, model, scan.views, cameras.poses(scan.views))
-        surface = fit_surface(model, reference, cloud, crown)
+        surface = fit_surface(model, reference, cloud, cameras.corrected(joint.rims), crown)
     return LaidBody(
         state=state,
         vertices=_rounded(surface.vertices),
@@ -199,9 +203,9 @@ def take_apart(
     parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, laid.cloud)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
-    verdict = judge(
-        parts, sides, findings, unexplained, stature_m, laid.state.beta, laid.camera_shifts_m
-    )
+    sunk = hands_sunk(model, surface.vertices)
+    beta, shifts = laid.state.beta, laid.camera_shifts_m
+    verdict = judge(parts, sides, sunk, findings, unexplained, stature_m, beta, shifts)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(
@@ -254,10 +258,14 @@ def _best_start(
             break
     assert best is not None
     done, steps = 0, len(MIDDLE) + len(FINE)
+    hands = sampling.hands
     for schedule in (MIDDLE, FINE):
         share = len(schedule) / steps
+        parts, places = model.part_of_vertex[::_RIM_EVERY], best.vertices[::_RIM_EVERY]
+        bodies = [places[np.isin(parts, hand.parts)] for hand in hands]
+        target = replace(target, rims=rims_of(views, cloud.camera_names, bodies))
         normals = vertex_normals(best.vertices, model.faces)
-        state = place_hands(model, sampling.hands, target.tree, best.state, best.vertices, normals)
+        state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)
         best = fit_jointly(
             model,
             sampling,

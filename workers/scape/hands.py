@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from station.geometry import so3_exp
 from workers.scape.correspondence import OrientedTree
 from workers.scape.kernels import trimmed_costs
-from workers.scape.model import BodyModel, BodyState
+from workers.scape.model import HAND, BodyModel, BodyState
 from workers.scape.sampled import SampledBody
 from workers.scape.spread import farthest_first
 
@@ -30,10 +30,12 @@ _FOREIGN_M = 0.025
 _CUT_M = 0.03
 _DIRECTION_SCALE_M = 0.02
 _MODEL_SHARE = 0.5
-_PRIOR_M = 2.5e-4
+_PRIOR_M = 1e-4
 """What one squared standard deviation off the prior costs, in metres of mean distance."""
 _ROUNDS = (96, 64, 48, 32)
 _ELITE = 8
+_CURL = 2.0
+"""What varies most is how far the fingers are closed: people make fists, poses hardly do."""
 _SPREAD = 1.25
 """Standard deviations of the prior that the first round spans."""
 
@@ -62,11 +64,12 @@ def hands_of(model: BodyModel) -> tuple[Hand, ...]:
 
 def _hand(model: BodyModel, side: str) -> Hand:
     names = model.part_names
-    parts = tuple(names.index(f"{part}_{side}") for part in ("hand", "thumb", "fingers"))
+    parts = tuple(names.index(f"{part}_{side}") for part in HAND)
     mine = np.flatnonzero(np.isin(model.part_of_vertex, parts))
     order = farthest_first(model.mean[mine], _SAMPLES)
     columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])
     values, vectors = np.linalg.eigh(model.twist_covariance[np.ix_(columns, columns)])
+    values[-1] *= _CURL**2
     body = model.at(mine[order])
     return Hand(
         side=side,

@@ -24,6 +24,7 @@ from workers.scape.crown import reach
 from workers.scape.free_space import FreeSpace
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
+from workers.scape.rims import rims_of
 from workers.scape.rows import CameraTerms, Rows, Skin, crown_rows, floor_rows, outline_rows
 from workers.scape.sampled import twist_chain
 from workers.scape.sampling import COARSE_SAMPLES, FINE_SAMPLES, Sampling
@@ -38,6 +39,10 @@ _THUMB_STIFFNESS = 3.0
 _PULLED_POINTS = 10_000
 _COARSELY_PULLED = 4
 """While the fit is coarse, every so many of them."""
+_ASIDE = 2.0
+"""A point is as far away as it lies ahead of a vertex, or at most so many times as far."""
+_SPACING_M = 0.002
+"""Points next to each other lie so far apart."""
 _EVERY = 1 << 20
 """Components: as many as the model has."""
 
@@ -91,6 +96,8 @@ class Target:
     """In the order of their corrections."""
     camera: NDArray[np.integer]
     """(n,): whose point it is."""
+    rims: PointCloud
+    """Of the hands, once it is known where they are."""
 
     @classmethod
     def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
@@ -106,6 +113,7 @@ class Target:
             FreeSpace.build(views),
             tuple(views),
             cloud.camera[used],
+            rims_of((), cloud.camera_names, ()),
         )
 
 
@@ -121,6 +129,8 @@ class JointResult:
     state: BodyState
     cameras: CameraCorrections
     vertices: Array
+    rims: PointCloud
+    """Of the hands, as the target had them."""
     correspondences: int
     iterations: int
 
@@ -138,7 +148,11 @@ def fit_jointly(
     """Minimise robust two-way distances with priors, coarse to fine."""
     prior = _TwistPrior.build(model)
     pulled = target.pulled
-    followers = Followers(model.neighbours, target.tree.points[pulled], target.tree.normals[pulled])
+    followers = Followers(
+        model.neighbours,
+        np.concatenate([target.tree.points[pulled], target.rims.points]),
+        np.concatenate([target.tree.normals[pulled], target.rims.normals]),
+    )
     terms: _DataTerms | None = None
     # What need not wait for one another is done side by side.
     with ThreadPoolExecutor(max_workers=2) as beside:
@@ -146,7 +160,7 @@ def fit_jointly(
             samples = sampling.body.first(stage.samples)
             derivative = beside.submit(samples.jacobian, state, stage.components)
             skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
-            probed = beside.submit(_probed, target, skin, stage)
+            probed = beside.submit(_probed, model, target, skin, stage)
             bounds = beside.submit(_bounds, model, target, cameras, skin, stage)
             terms = _data_terms(target, followers, probed, bounds, cameras, skin, stage)
             if observer is not unobserved:
@@ -155,7 +169,9 @@ def fit_jointly(
             state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
             progress((step + 1) / len(schedule))
     assert terms is not None
-    return JointResult(state, cameras, model.vertices(state), len(terms.on_body), len(schedule))
+    return JointResult(
+        state, cameras, model.vertices(state), target.rims, len(terms.on_body), len(schedule)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,12 +188,31 @@ class _DataTerms:
     """(m, 3): the other."""
 
 
-def _probed(target: Target, skin: Skin, stage: Stage) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _probed(
+    model: BodyModel, target: Target, skin: Skin, stage: Stage
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Even places of the skin that have a point, and which."""
     cloud = target.coarse if stage.coarse else target.tree
     probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * stage.samples)))
     probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **stage.limits)
-    return probes[probing], target.pulled[found] if stage.coarse else found
+    place = probes[probing]
+    if stage.coarse:
+        return place, target.pulled[found]
+    kept = ~np.isin(skin.part[place], model.hand_parts)
+    kept |= _before(skin.positions[place], skin.normals[place], cloud.points[found])
+    return place[kept], found[kept]
+
+
+def _before(places: Array, normals: Array, points: Array) -> NDArray[np.bool_]:
+    """Whether points (n, 3) lie before or behind oriented places (n, 3) rather than beside them.
+
+    The tip of a finger gives no reading: what is nearest to it is the cloud's border, and would
+    draw it back (pairs at a mesh's border are left out since Turk & Levoy 1994).
+    """
+    offset = points - places
+    away = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+    ahead = np.abs(np.einsum("ni,ni->n", offset, normals))
+    return np.asarray(away < _ASIDE * ahead + _SPACING_M)
 
 
 def _bounds(
@@ -211,24 +246,50 @@ def _data_terms(
     else:
         pulled = target.pulled
         asking, mine = followers.pairs(skin.positions, skin.normals, **stage.limits)
+        # The rims come after the points.
+        border = int(np.searchsorted(asking, len(pulled)))
+        rimmed, at_rims = asking[border:] - len(pulled), mine[border:]
+        asking, mine = asking[:border], mine[:border]
     probes, found = probed.result()
     place = np.concatenate([mine, probes])
     point = np.concatenate([pulled[asking], found])
     on_body, camera = skin.positions[place], target.camera[point]
     on_cloud = cameras.moved(cloud.points[point], camera)
     direction = skin.normals[place]
-    residual = np.einsum("ni,ni->n", direction, on_cloud - on_body)
-    variance = target.sigma_m[point] ** 2 + _MODEL_SIGMA_M**2
-    robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
-    pairs = Rows(place, direction, residual, stage.row_share * robust / variance)
+    rows = [_pulled(place, direction, on_cloud - on_body, target.sigma_m[point], stage)]
     camera_terms = None
-    if len(cameras) and not stage.coarse:
-        derivative = cameras.derivative(on_cloud, camera, direction)
-        camera_terms = CameraTerms.build(
-            pairs, derivative, camera, len(cameras), skin, stage.samples
-        )
-    weight, pull = Rows.joined(pairs, *bounds.result()).at_samples(skin, stage.samples)
+    if not stage.coarse:
+        if len(cameras):
+            derivative = cameras.derivative(on_cloud, camera, direction)
+            camera_terms = CameraTerms.build(
+                rows[0], derivative, camera, len(cameras), skin, stage.samples
+            )
+        rows.append(_rim_rows(target.rims, rimmed, cameras, skin, at_rims, stage))
+    weight, pull = Rows.joined(*rows, *bounds.result()).at_samples(skin, stage.samples)
     return _DataTerms(weight, pull, camera_terms, on_body, on_cloud)
+
+
+def _rim_rows(
+    rims: PointCloud,
+    rimmed: NDArray[np.intp],
+    cameras: CameraCorrections,
+    skin: Skin,
+    place: NDArray[np.intp],
+    stage: Stage,
+) -> Rows:
+    """Places of hands end where cameras saw them end before the booth."""
+    offset = cameras.moved(rims.points[rimmed], rims.camera[rimmed]) - skin.positions[place]
+    return _pulled(place, rims.normals[rimmed], offset, rims.sigma_m[rimmed], stage)
+
+
+def _pulled(
+    place: NDArray[np.intp], direction: Array, offset: Array, sigma_m: Array, stage: Stage
+) -> Rows:
+    """Places of the skin that go by an offset (n, 3) as far as it is along a direction (n, 3)."""
+    residual = np.einsum("ni,ni->n", direction, offset)
+    robust = 1.0 / (1.0 + (residual / stage.scale_m) ** 2) ** 2
+    variance = sigma_m**2 + _MODEL_SIGMA_M**2
+    return Rows(place, direction, residual, stage.row_share * robust / variance)
 
 
 @dataclass(frozen=True, slots=True)

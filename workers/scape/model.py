@@ -35,6 +35,9 @@ FORMAT = "booth-body-model"
 VERSIONS = frozenset({1})
 SHIPPED = "data/body.npz"
 
+HAND = ("hand", "thumb", "fingers")
+"""The parts that a hand is made of, every one after its parent."""
+
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
@@ -96,6 +99,11 @@ class BodyModel:
     def part_of_vertex(self) -> NDArray[np.int32]:
         """(P,): the part with the largest weight."""
         return np.argmax(self.vertex_weights, axis=1).astype(np.int32)
+
+    @cached_property
+    def hand_parts(self) -> NDArray[np.intp]:
+        """Those of both hands."""
+        return np.flatnonzero([name.rpartition("_")[0] in HAND for name in self.part_names])
 
     @cached_property
     def solver(self) -> EdgeSolver:

@@ -59,16 +59,22 @@ class SurfaceFit:
 
 
 def fit_surface(
-    model: BodyModel, vertices: Array, cloud: PointCloud, crown: Callable[[Array], Reach]
+    model: BodyModel,
+    vertices: Array,
+    cloud: PointCloud,
+    rims: PointCloud,
+    crown: Callable[[Array], Reach],
 ) -> SurfaceFit:
-    """Lay the model's surface (P, 3) on the cloud's points.
+    """Lay the model's surface (P, 3) on the cloud's points, and on rims where the cloud ends.
 
     Where a surface's crown is seen to end besides, a function of its vertices says: the field would
     carry there, where no point is, what the points around it ask for.
     """
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
-    followers = Followers(model.neighbours, cloud.points[every], cloud.normals[every], dense=True)
-    noise = cloud.sigma_m[every]
+    points = np.concatenate([cloud.points[every], rims.points])
+    directions = np.concatenate([cloud.normals[every], rims.normals])
+    followers = Followers(model.neighbours, points, directions, dense=True)
+    noise = np.concatenate([cloud.sigma_m[every], rims.sigma_m])
     laplacian = _membrane(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
