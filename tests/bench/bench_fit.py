@@ -74,7 +74,8 @@ def nricp(model: BodyModel, scan: Preprocessed) -> Array:
     cloud = scan.cloud
     every = slice(None, None, max(1, len(cloud) // 20_000))
     scout = sampling_of(model).body.first(250)
-    start = model.vertices(starting_states(model, scout, cloud.points[:: len(cloud) // 800])[0])
+    few = cloud.points[:: len(cloud) // 800]
+    start = model.vertices(starting_states(model, scout, few, cloud.points)[0])
     target = trimesh.PointCloud(cloud.points[every])
     source = trimesh.Trimesh(start, model.faces, process=False)
     # Each step: smoothness, landmarks, normals, and how often at most.

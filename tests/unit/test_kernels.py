@@ -194,7 +194,7 @@ def test_the_start_has_the_arms_where_the_cloud_has_them(
     vertices[:, 2] -= vertices[:, 2].min()
     scout = model.at(np.arange(0, model.vertex_count, 53))
     cloud, _ = _skin_points(model, vertices, 800)
-    best = model.vertices(starting_states(model, scout, cloud)[0])
+    best = model.vertices(starting_states(model, scout, cloud, cloud)[0])
     for side in ("left", "right"):
         hand = model.part_of_vertex == model.part_names.index(f"hand_{side}")
         assert np.linalg.norm((best - vertices)[hand].mean(axis=0)) < 0.2

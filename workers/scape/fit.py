@@ -19,7 +19,7 @@ from workers.scape.cameras import CameraCorrections
 from workers.scape.crown import reach
 from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
-from workers.scape.initial import facing_deg, starting_states
+from workers.scape.initial import starting_states
 from workers.scape.intersections import untangled
 from workers.scape.joint import (
     COARSE,
@@ -55,8 +55,8 @@ _LEAST_POINTS = 1500
 _TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
-_FACING_POINTS = 6000
-"""Enough to tell where the toes are."""
+_FACING_EVERY = 10
+"""Of the points: enough to tell where the toes are."""
 _MOST_STARTS = 4
 _RIM_EVERY = 8
 """So many of a hand's vertices say about where it is."""
@@ -151,7 +151,7 @@ def lay_body(
     few = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
     with ThreadPoolExecutor(1) as beside:
         building = beside.submit(Target.build, cloud, scan.views, most_points)
-        starts = starting_states(model, scout, few, facing_deg(_thinned(cloud.points)))
+        starts = starting_states(model, scout, few, cloud.points[::_FACING_EVERY])
         target = building.result()
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
@@ -224,10 +224,6 @@ def take_apart(
         camera_shifts_m=laid.camera_shifts_m,
         seconds={**laid.seconds, "judge": time.monotonic() - start},
     )
-
-
-def _thinned(points: Array) -> Array:
-    return points[:: max(1, len(points) // _FACING_POINTS)]
 
 
 def _rounded(vertices: Array) -> Array:

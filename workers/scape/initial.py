@@ -18,8 +18,12 @@ Array = NDArray[np.float64]
 _NEUTRAL_ARM_DEG = 43.0
 _ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+_AROUND_DEG = tuple(float(turn) for turn in range(-180, 180, 24))
+_FEW_ARMS_DEG = (12.0, 39.0, 66.0)
 _FACING_DEG = 36.0
 """Who is turned by less faces the booth's front."""
+_FEET, _ANKLES = 0.04, (0.06, 0.12)
+"""Up to and between which shares of the stature."""
 _TOES_M = 0.01
 """How far feet reach ahead of their ankles, at the least."""
 _SWINGS_DEG = (-25.0, 0.0, 25.0)
@@ -71,14 +75,14 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
 
 
 def starting_states(
-    model: BodyModel, scout: SampledBody, points: Array, about_deg: float = 0.0
+    model: BodyModel, scout: SampledBody, points: Array, cloud: Array
 ) -> list[BodyState]:
-    """States to start from, best first, judged on a coarse sample of the cloud (n, 3).
+    """States to start from, best first, judged on a coarse sample (n, 3) of a cloud (m, 3).
 
-    First both arms at one angle and all headings about one, then each arm alone at the
-    best heading, then each arm swung forward and back.
+    First where the person roughly looks; then both arms at one angle and all headings about that,
+    then each arm alone at the best heading, then each arm swung forward and back.
     """
-    stature = _stature_m(points)
+    stature = float(np.quantile(points[:, 2], 0.9995))
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
     trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
     center = np.median(trunk if len(trunk) > 50 else points, axis=0)
@@ -91,8 +95,11 @@ def starting_states(
         return _costs(bodies, points), states
 
     straight = (0.0, 0.0)
+    around = [((arm, arm), straight, turn) for arm, turn in product(_FEW_ARMS_DEG, _AROUND_DEG)]
+    roughly = around[int(np.argmin(scored(around)[0]))][2]
+    facing = facing_deg(roughly, cloud, stature)
     together = [
-        ((arm, arm), straight, about_deg + turn) for arm, turn in product(_ARMS_DEG, _HEADINGS_DEG)
+        ((arm, arm), straight, facing + turn) for arm, turn in product(_ARMS_DEG, _HEADINGS_DEG)
     ]
     heading = together[int(np.argmin(scored(together)[0]))][2]
     apart = [(arms_deg, straight, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)]
@@ -104,29 +111,25 @@ def starting_states(
     return [states[index] for index in np.argsort(costs, kind="stable")]
 
 
-def facing_deg(points: Array) -> float:
-    """Roughly where a person looks, degrees about z from -y, of a cloud (n, 3) on the floor.
+def facing_deg(heading_deg: float, cloud: Array, stature_m: float) -> float:
+    """A heading or its opposite, which a coarse body can hardly tell apart: toes point ahead.
 
-    Shoulders are broader than deep, and toes point ahead.
+    Args:
+        heading_deg: about z from -y.
+        cloud: (m, 3), standing on z = 0.
     """
-    height = points[:, 2] / _stature_m(points)
-    shoulders = points[(height > 0.70) & (height < 0.84), :2]
-    feet, ankles = points[height < 0.04, :2], points[(height > 0.06) & (height < 0.12), :2]
-    if min(len(shoulders), len(feet), len(ankles)) < 3:
-        return 0.0
-    depth = np.linalg.eigh(np.cov(shoulders.T))[1][:, 0]
-    own = cKDTree(ankles).query(feet)[1]
-    ahead = float(depth @ (feet - ankles[own]).mean(axis=0))
-    forward = depth if ahead > 0.0 else -depth
+    height = cloud[:, 2] / stature_m
+    feet = cloud[height < _FEET, :2]
+    ankles = cloud[(height > _ANKLES[0]) & (height < _ANKLES[1]), :2]
+    turn = np.radians(heading_deg)
+    ahead = 0.0
+    if len(feet) and len(ankles):
+        own = cKDTree(ankles).query(feet)[1]
+        ahead = float((feet - ankles[own]).mean(axis=0) @ (np.sin(turn), -np.cos(turn)))
     # Feet that do not tell leave the booth's front.
-    if abs(ahead) < _TOES_M and forward[1] > 0.0:
-        forward = -forward
-    facing = float(np.degrees(np.arctan2(forward[0], -forward[1])))
+    away = ahead < 0.0 if abs(ahead) > _TOES_M else np.cos(turn) < 0.0
+    facing = (heading_deg + (360.0 if away else 180.0)) % 360.0 - 180.0
     return 0.0 if abs(facing) < _FACING_DEG else facing
-
-
-def _stature_m(points: Array) -> float:
-    return float(np.quantile(points[:, 2], 0.9995))
 
 
 def _placed(

@@ -70,7 +70,7 @@ def register(
     surface = _Surface.build(vertices, faces)
     scouts = samples.first(_SCOUT_SAMPLES)
     every = max(1, len(vertices) // _SCOUT_POINTS)
-    state = starting_states(model, scouts, vertices[::every])[0]
+    state = starting_states(model, scouts, vertices[::every], vertices)[0]
     share = _share_of_samples(model, samples)
     owner = _nearest_sample(model, samples)
     information = np.linalg.inv(
