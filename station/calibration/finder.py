@@ -6,21 +6,26 @@ from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
+import numpy as np
+
 from station.calibration.ball import find_ball
 from station.calibration.detections import BallDetection
 from station.calibration.feed import TimedFrame
+from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.calibration.session import Session
 
 _THREADS = 2
 _WAITING = 6
 """More frames than that do not wait: newer ones come."""
+_APART_S = 0.75 / INDEPENDENT_HZ
+"""Frames come at a fixed rate: what is nearer than that is nearer than wanted."""
 
 
 class BallFinder:
     """Finds the ball of a session in front of its empty booth. Use it in a ``with`` statement."""
 
     def __init__(self, session: Session, *, patient: bool) -> None:
-        """``patient``: look at every frame, however long that takes."""
+        """``patient``: no frame is left out for want of time."""
         self._radius_m, self._cameras = session.radius_m, session.lensed_cameras()
         self._backgrounds = {
             name: view.depth_m()
@@ -28,6 +33,7 @@ class BallFinder:
             if (view := session.background(name)) is not None
         }
         self._patient = patient
+        self._last_s: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(_THREADS)
         self._pending: deque[Future[BallDetection | None]] = deque()
 
@@ -38,9 +44,12 @@ class BallFinder:
         self._pool.shutdown(cancel_futures=True)
 
     def look(self, frames: Iterable[TimedFrame]) -> None:
-        """Take frames to look at."""
+        """Take frames to look at: of each camera so many a second as are worth it."""
         for frame in frames:
-            if self._patient or len(self._pending) < _WAITING:
+            # A clock that is reset may also go back.
+            apart_s = abs(frame.time_s - self._last_s.get(frame.camera, np.inf))
+            if apart_s > _APART_S and (self._patient or len(self._pending) < _WAITING):
+                self._last_s[frame.camera] = frame.time_s
                 self._pending.append(self._pool.submit(self._find, frame))
 
     def found(self, *, wait: bool = False) -> list[BallDetection]:

@@ -11,10 +11,11 @@ from station.calibration.ball import find_ball
 from station.calibration.detections import BallDetection, Observations, PlaneObservation
 from station.calibration.planes import observe_floor, observe_wall
 from station.calibration.rig import CameraCalibration
+from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.clock import DeviceClock
 from station.depth.average import average
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual import TICK_HZ
+from station.drivers.virtual import FRAME_RATE_HZ, TICK_HZ
 from station.drivers.virtual_calibration import (
     AROUND,
     BALL,
@@ -24,18 +25,17 @@ from station.drivers.virtual_calibration import (
     VirtualProcedure,
 )
 
-_Depth = NDArray[np.float32]
+_Depth = NDArray[np.uint16]
 
 _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
 _LOOK_S = 1.0
 """At the ball on the floor, and at the board."""
+_STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
 
 
-def simulate(
-    procedure: VirtualProcedure, camera: CameraCalibration, *, stride: int = 2
-) -> Observations:
-    """What one camera contributes: ball every stride-th frame, resting places, floor, boards."""
+def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observations:
+    """What one camera contributes: the ball's way and resting places, floor, boards."""
     name = camera.name
     index = list(procedure.booth.rig.cameras).index(name)
     rng = np.random.default_rng((procedure.booth.seed, index, 4))
@@ -45,34 +45,31 @@ def simulate(
         for frame in procedure.frames(name, step, stride=every, limit_s=limit_s):
             delay_s = _TRANSPORT_S[0] + rng.exponential(_TRANSPORT_S[1])
             time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)
-            yield time_s, (TABLE[frame.raw] * np.float32(DEPTH_SCALE_M)).astype(np.float32)
+            yield time_s, TABLE[frame.raw]
 
-    def still(step: str, limit_s: float | None) -> NDArray[np.uint16]:
-        stack = np.stack([np.rint(depth / DEPTH_SCALE_M) for _, depth in timed(step, limit_s, 1)])
-        return stack.astype(np.uint16)
+    def still(step: str, limit_s: float | None) -> _Depth:
+        return np.stack([depth for _, depth in timed(step, limit_s, 1)])
 
     empty = still(EMPTY, None)
     background = average(empty, DEPTH_SCALE_M).depth_m
 
-    def balls(step: str, limit_s: float | None, every: int) -> list[BallDetection]:
+    def balls(step: str, limit_s: float | None) -> list[BallDetection]:
         found = (
-            find_ball(depth, camera, procedure.radius_m, time_s, background)
-            for time_s, depth in timed(step, limit_s, every)
+            find_ball(
+                depth * np.float32(DEPTH_SCALE_M), camera, procedure.radius_m, time_s, background
+            )
+            for time_s, depth in timed(step, limit_s, _STRIDE)
         )
         return [detection for detection in found if detection is not None]
 
     planes: list[PlaneObservation | None] = [observe_floor(empty, DEPTH_SCALE_M, camera)]
-    waved, mark, front = (
-        balls(BALL, None, stride),
-        balls(MARK, _LOOK_S, 2),
-        balls(FRONT, _LOOK_S, 2),
-    )
+    waved, mark, front = balls(BALL, None), balls(MARK, _LOOK_S), balls(FRONT, _LOOK_S)
     for step in procedure.steps:
         if step.startswith("wall-"):
             planes.append(
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )
-    around = {step: balls(step, _LOOK_S, 2) for step in procedure.steps if step.startswith(AROUND)}
+    around = {step: balls(step, _LOOK_S) for step in procedure.steps if step.startswith(AROUND)}
     return Observations(
         waved, mark, front, [plane for plane in planes if plane is not None], around
     )

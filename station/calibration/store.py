@@ -73,6 +73,10 @@ class CalibrationStore:
             for folder in self._folders()
         ]
 
+    def newest(self) -> str | None:
+        """Name of the last stored calibration, if there is one."""
+        return max((folder.name for folder in self._folders()), default=None)
+
     def _folders(self) -> list[Path]:
         return [
             path.parent

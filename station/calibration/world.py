@@ -121,6 +121,17 @@ def relative(placed: Placed, a: str, b: str) -> tuple[Array, Array]:
     return transforms[0], covariance
 
 
+def sigma_to(placed: Placed, reference: str, name: str) -> tuple[float, float]:
+    """Largest standard deviations of a camera's place (m) and turn (rad) from the reference's."""
+    if name == reference:
+        return 0.0, 0.0
+    _, covariance = relative(placed, reference, name)
+    return (
+        float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
+        float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
+    )
+
+
 def _adjoint(b_from_a: Array) -> Array:
     """(6, 6): a small xi (rotation, translation) of frame a as one of frame b."""
     rotation, shift = b_from_a[:3, :3], b_from_a[:3, 3]

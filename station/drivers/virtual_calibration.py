@@ -29,7 +29,7 @@ _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""
 _STILL_FRAMES = 8
 _BOARD_M = (1.2, 2.1)
-_BOARD_THICKNESS_M = 0.02
+_BOARD_THICK_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,9 @@ class VirtualProcedure:
     """y of the board's middle at each of its places."""
     around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
     """x, y of the ball at each of its places on the floor around the mark."""
+    _views: dict[tuple[str, float | None], TrueView] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def steps(self) -> tuple[str, ...]:
@@ -70,7 +73,7 @@ class VirtualProcedure:
         calibration = self.booth.rig.cameras[camera]
         index = list(self.booth.rig.cameras).index(camera)
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
-        view = self._still(camera, step)
+        view = self._still(camera, self._board_y_m(step))
         # Behind what moves a short loop flickers on; only what moves is drawn anew each frame.
         moves = step in (BALL, MARK, FRONT) or step.startswith(AROUND)
         still = NoiselessView.of(view, unit.error)
@@ -100,15 +103,23 @@ class VirtualProcedure:
     def _lasts_s(self, step: str) -> float:
         return self.waving_s if step == BALL else _REST_S
 
-    def _still(self, camera: str, step: str) -> TrueView:
-        meshes: list[Mesh] = [*(booth_walls() if self.booth.walls else ()), *self.booth.clutter]
-        if step.startswith("wall-"):
-            y = self.board_at_m[int(step.removeprefix("wall-"))]
-            half, high = 0.5 * _BOARD_M[0], _BOARD_M[1]
-            thick = 0.5 * _BOARD_THICKNESS_M
-            meshes.append(box((-half, y - thick, 0.0), (half, y + thick, high)))
-        calibration = self.booth.rig.cameras[camera]
-        return VirtualScene(meshes).view(calibration, calibration.world_from_camera)
+    def _board_y_m(self, step: str) -> float | None:
+        return (
+            self.board_at_m[int(step.removeprefix("wall-"))] if step.startswith("wall-") else None
+        )
+
+    def _still(self, camera: str, board_y_m: float | None) -> TrueView:
+        """What does not move; most steps share it."""
+        if (camera, board_y_m) not in self._views:
+            meshes: list[Mesh] = [*(booth_walls() if self.booth.walls else ()), *self.booth.clutter]
+            if board_y_m is not None:
+                half, high = 0.5 * _BOARD_M[0], _BOARD_M[1]
+                near, far = board_y_m - 0.5 * _BOARD_THICK_M, board_y_m + 0.5 * _BOARD_THICK_M
+                meshes.append(box((-half, near, 0.0), (half, far, high)))
+            calibration = self.booth.rig.cameras[camera]
+            view = VirtualScene(meshes).view(calibration, calibration.world_from_camera)
+            self._views[camera, board_y_m] = view
+        return self._views[camera, board_y_m]
 
     def _moving(self, step: str, time_s: float) -> list[Capsule]:
         if step == BALL:

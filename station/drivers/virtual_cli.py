@@ -10,7 +10,14 @@ from pathlib import Path
 
 import click
 
-from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
+from station.calibration.sensor_noise import INDEPENDENT_HZ
+from station.drivers.virtual import (
+    FRAME_RATE_HZ,
+    TICK_HZ,
+    SimulatedBooth,
+    VirtualCamera,
+    recorded_frames,
+)
 from station.drivers.virtual_calibration import EMPTY, VirtualProcedure
 from station.drivers.virtual_scene import fixed_posts, load_mesh
 from station.recording import RecordedFrame, write_recording
@@ -18,8 +25,8 @@ from station.recording import RecordedFrame, write_recording
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error where a calibration has to find it."""
-_STRIDE = 2
-"""Every second frame is enough, but of the empty booth: the floor is hardly seen."""
+_STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
+"""No more frames are looked at, but of the empty booth: the floor is hardly seen."""
 _BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 

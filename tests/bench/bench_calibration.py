@@ -41,8 +41,6 @@ from station.geometry import invert
 Array = NDArray[np.float64]
 
 _BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
-_STRIDE = 3
-"""Ten frames a second."""
 _CYLINDER_M = (0.15, 1.7)
 _REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
 
@@ -69,7 +67,7 @@ def calibrate(seed: int) -> Row | str:
     booth = synthetic.booth(seed)
     procedure = VirtualProcedure(booth)
     cameras = synthetic.factory(booth.rig)
-    seen = [simulate(procedure, camera, stride=_STRIDE) for camera in cameras.values()]
+    seen = [simulate(procedure, camera) for camera in cameras.values()]
     observations = Observations.merged(seen)
     start_s = time.perf_counter()
     try:

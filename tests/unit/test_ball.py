@@ -86,6 +86,27 @@ def test_fingers_on_the_ball_do_not_pull_it(camera: CameraCalibration) -> None:
     assert np.linalg.norm(away.mean(axis=0)) < 1.5e-3
 
 
+def test_fingers_on_a_distant_ball_do_not_pull_it(camera: CameraCalibration) -> None:
+    """Too narrow to be told from noise, in frame after frame they moved a whole booth by 3 mm."""
+    right, down, ahead = camera.world_from_camera[:3, :3].T
+    truth = np.array([0.1, 0.0, 2.15])
+    center = transform(camera.world_from_camera, truth)
+    grip, towards = 0.8 * right - 0.6 * ahead, -0.6 * right - 0.8 * ahead
+    hand = center + 0.125 * grip
+    fingers = [
+        Capsule(hand, center + 0.106 * (0.75 * grip + 0.66 * side), 0.009)
+        for side in (np.cos(a) * towards + np.sin(a) * down for a in (-1.2, -0.5, 0.2, 0.9))
+    ]
+    palm = Capsule(hand, hand + 0.02 * grip, 0.042)
+    found = [
+        find_ball(image, camera, 0.1, 0.0)
+        for image in images(camera, [ball(center, 0.1), palm, *fingers], 40)
+    ]
+    away = np.array([one.center_m - truth for one in found if one is not None])
+    assert len(away) >= 30
+    assert np.linalg.norm(away.mean(axis=0)) < 2.0e-3
+
+
 def test_a_ball_of_another_size_is_found_and_told(camera: CameraCalibration) -> None:
     found = [
         find_ball(image, camera, 0.1, 0.0) for image in images(camera, [ball(CENTER, 0.085)], 6)

@@ -66,6 +66,16 @@ def test_stored_calibrations_are_listed_and_put_into_use(
     assert "20261101T100000Z, 20261102T100000Z" in str(wrong.exception)
 
 
+def test_after_a_finished_calibration_solve_says_so(config: Path, store: CalibrationStore) -> None:
+    """It once said that none had been begun, an hour after the operator had done all steps."""
+    _begin(store)
+    store.finish(replace(default_rig(), created="2026-11-01T10:00:00Z"), {})
+    refused = _run(config, "solve")
+    assert isinstance(refused.exception, CalibrationError)
+    assert "20261101T100000Z, is finished" in str(refused.exception)
+    assert "station calibrate begins another" in str(refused.exception)
+
+
 def test_a_step_reads_its_own_configuration(tmp_path: Path) -> None:
     """The group once read booth.toml before the step could say which."""
     missing = CliRunner().invoke(calibrate, ["solve", "--config", str(tmp_path / "other.toml")])

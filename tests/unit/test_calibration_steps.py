@@ -12,7 +12,9 @@ import pytest
 from station.calibration import finder
 from station.calibration.detections import BallDetection
 from station.calibration.feed import Feed, TimedFrame
+from station.calibration.finder import BallFinder
 from station.calibration.guide import Guide
+from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.calibration.session import Session
 from station.calibration.steps import wave_ball
 from station.drivers.virtual_scene import default_rig
@@ -76,3 +78,24 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     assert len(before) == 50
     assert sum(ball.camera == _CAMERAS[0] for ball in before) == 25
     assert "3 frames were missed" in capsys.readouterr().out
+
+
+def test_no_more_frames_are_looked_at_than_are_worth_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neighbouring frames share their errors: all 30 a second made a booth seem surer than it was.
+
+    A clock that goes back must not stop the looking.
+    """
+    looked: list[float] = []
+    monkeypatch.setattr(finder, "find_ball", lambda *args, **_: looked.append(args[3]))
+    session = Session.begin(
+        tmp_path, "2026-11-21T10:00:00Z", 0.1, {_CAMERAS[0]: default_rig().cameras[_CAMERAS[0]]}
+    )
+    image = np.zeros((4, 4), np.uint16)
+    with BallFinder(session, patient=True) as looking:
+        for start_s in (500.0, 20.0):
+            times = [start_s + number / 30.0 for number in range(30)]
+            looking.look(TimedFrame(_CAMERAS[0], time_s, image, 1e-3) for time_s in times)
+        looking.found(wait=True)
+    assert len(looked) == 2 * INDEPENDENT_HZ
