@@ -46,7 +46,6 @@ from fit_report import (
     print_row,
     print_summary,
     print_worst_parts,
-    words_of,
 )
 from numpy.typing import NDArray
 from surface_errors import surface_errors
@@ -60,6 +59,7 @@ from workers.job import reconstruct_bundle, warm_up
 from workers.scape.fit import fit_body, sampling_of
 from workers.scape.initial import starting_states
 from workers.scape.model import BodyModel
+from workers.scape.verdict import words_of
 
 Array = NDArray[np.float64]
 

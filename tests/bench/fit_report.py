@@ -10,6 +10,7 @@ from fit_cases import Case
 from surface_errors import SurfaceErrors
 
 from workers.scape.fit import FitResult
+from workers.scape.verdict import words_of
 
 _LOST_MM = 15.0
 _PAPERS_SECONDS = 60.0
@@ -67,12 +68,6 @@ class Bar:
         sign = ">=" if self.at_least else "<="
         shown = f"{self.value:10.2f} {sign} {self.limit:g} {self.unit}"
         return f"{self.words:<58}{shown:<28}{'met' if met else 'MISSED'}"
-
-
-def words_of(part: str) -> str:
-    """As the operator reads it."""
-    stem, _, side = part.rpartition("_")
-    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
 
 
 def print_header() -> None:

@@ -40,7 +40,6 @@ from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,
     PartReport,
     Verdict,
-    hands_sunk,
     judge,
     report_parts,
     sides_seen,
@@ -203,9 +202,8 @@ def take_apart(
     parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, laid.cloud)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
-    sunk = hands_sunk(model, surface.vertices)
     beta, shifts = laid.state.beta, laid.camera_shifts_m
-    verdict = judge(parts, sides, sunk, findings, unexplained, stature_m, beta, shifts)
+    verdict = judge(parts, sides, findings, unexplained, stature_m, beta, shifts)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from station.depth import Finding, PointCloud
 from workers.scape.correspondence import OrientedTree
@@ -33,9 +32,6 @@ _TRUNK = ("pelvis", "abdomen", "chest")
 _SIDES = {"front": -1.0, "back": 1.0}
 """The template faces -y."""
 _FACING = 0.7
-_SUNK_M = 0.010
-"""Farther than this no flesh gives way to a hand that rests on it."""
-_SUNK_SHARE = 0.25
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
 
@@ -101,26 +97,6 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     return shares
 
 
-def hands_sunk(model: BodyModel, vertices: Array) -> dict[str, float]:
-    """Shares of either hand that lie inside trunk or thighs: it was taken for a part of them.
-
-    Cameras see such a hand's place, and the flesh over it meets their points.
-    """
-    names = [name.removesuffix("_left").removesuffix("_right") for name in model.part_names]
-    part = model.part_of_vertex
-    flesh = np.isin(part, np.flatnonzero(np.isin(names, (*_TRUNK, "thigh"))))
-    places, normals = vertices[flesh], vertex_normals(vertices, model.faces)[flesh]
-    tree = cKDTree(places)
-    shares = {}
-    for name, members in _groups(model).items():
-        if name.startswith(HAND):
-            hand = vertices[np.isin(part, members)][::4]
-            nearest = tree.query(hand)[1]
-            depth = np.einsum("ni,ni->n", normals[nearest], places[nearest] - hand)
-            shares[name] = float(np.mean(depth > _SUNK_M))
-    return shares
-
-
 def _unmet(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
     """A few stray points are noise; a cluster of them is a limb that the fit lost."""
     lost = int(np.count_nonzero(around & unexplained))
@@ -156,7 +132,6 @@ def _groups(model: BodyModel) -> dict[str, list[int]]:
 def judge(
     parts: Sequence[PartReport],
     sides: dict[str, float],
-    sunk: dict[str, float],
     findings: Sequence[Finding],
     unexplained: float,
     stature_m: float,
@@ -177,13 +152,8 @@ def judge(
     for side, share in sides.items():
         if share < _SEEN_ENOUGH:
             reasons.append(f"the person's {side} not seen ({100 * share:.0f} % of it)")
-    for name, share in sunk.items():
-        if share > _SUNK_SHARE:
-            reasons.append(
-                f"{_words(name)} not told from what it rests on; hold it away from the body"
-            )
     for part in parts:
-        words = _words(part.name)
+        words = words_of(part.name)
         enough = _EXTREMITY_SEEN_ENOUGH if part.name.startswith(_EXTREMITIES) else _SEEN_ENOUGH
         if part.coverage < enough:
             reasons.append(f"{words} not seen ({100 * part.coverage:.0f} % of it)")
@@ -200,7 +170,7 @@ def judge(
     return Verdict("rescan" if reasons else "ok", tuple(reasons))
 
 
-def _words(part: str) -> str:
-    """As the operator reads it."""
+def words_of(part: str) -> str:
+    """A part's name as the operator reads it."""
     stem, _, side = part.rpartition("_")
     return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
