@@ -87,8 +87,13 @@ def test_a_camera_says_it_once_however_many_columns_it_has(
     assert twice.information.sum() == pytest.approx(2.0 * once.information.sum())
 
 
-def test_where_no_booth_is_seen_behind_nothing_is_said(model: BodyModel, body: np.ndarray) -> None:
-    assert not len(_reach(model, _view(model, body, walls=False), body).vertex)
+def test_where_no_booth_is_seen_a_head_is_no_lower_than_its_last_reading(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    view = _view(model, body, walls=False)
+    assert 0.001 < np.mean(_reach(model, view, body - HIGHER).distance_m) < 0.0075
+    assert not len(_reach(model, view, body + HIGHER).vertex)
+    assert not len(_reach(model, _view(model, body, walls=False, bald=False), body).vertex)
 
 
 def test_hair_that_gives_no_reading_is_no_crown(model: BodyModel, body: np.ndarray) -> None:

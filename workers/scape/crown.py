@@ -2,7 +2,8 @@
 where they end the booth is seen behind them.
 
 In a column of an image the head's last reading, a gap and the booth's first reading follow each
-other; the head ends half a pixel before the latter.
+other; the head ends half a pixel before the latter. Of a tall person's head, with no booth behind,
+the last reading alone says how high it reaches at the least.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ _WIDEST_PX = 12
 _BEHIND_M = 0.08
 _NEARER_M = 0.12
 """The last reading of a flat skull is so much nearer than its outline."""
+_BEYOND_M = 0.0045
+"""So much of a head lies beyond its last reading: a Kinect reads up to 70 or 75 degrees of
+incidence, beyond which a radius of 8 to 12 cm leaves 3 to 7 mm."""
 _LEAST_COLUMNS = 6
 _SIGMA_M = 0.0015
 """Of one camera's word, however many columns it has: half a pixel, or 0.05 degrees of its pose."""
@@ -117,23 +121,27 @@ def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
     out = 1 if pose[2, 1] > 0.0 else -1
     column, row, place = _outline(places * (1, out), cap.edges, width)
     row *= out
-    edge = _edge(view.depth_m, column, np.rint(row).astype(np.intp), out, local[place, 2])
-    used = (edge >= 0) & (cap.points[place, 2] > cap.points[:, 2].max() - _CROWN_M)
-    count = int(used.sum())
-    if count < _LEAST_COLUMNS:
-        return _UNSEEN
-    row, place, edge = row[used], place[used], edge[used]
+    rows = np.rint(row).astype(np.intp)
+    booth, last = _ends(view.depth_m, column, rows, out, local[place, 2])
+    pixel_m = local[place, 2] / K[1, 1]
     slope = (row - K[1, 2]) / K[1, 1]
     length = np.hypot(1.0, slope)
     # Out of the plane of the ray and the row.
     direction = out * (pose[:3, 1] - slope[:, None] * pose[:3, 2]) / length[:, None]
-    higher_px = out * (edge - row) - 0.5
-    return Reach(
-        cap.vertex[place],
-        direction,
-        higher_px * local[place, 2] / (K[1, 1] * length),
-        np.full(count, 1.0 / (count * _SIGMA_M**2)),
-    )
+    high = cap.points[place, 2] > cap.points[:, 2].max() - _CROWN_M
+    used = high & (booth >= 0)
+    distance = (out * (booth - row) - 0.5) * pixel_m / length
+    if np.count_nonzero(used) < _LEAST_COLUMNS:
+        used = high & (last >= 0)
+        distance = out * (last - row) * pixel_m / length + _BEYOND_M
+        # Dark hair ends readings as well: they do not say that a head is lower.
+        if not used.any() or np.median(distance[used]) < 0.0:
+            return _UNSEEN
+    count = int(used.sum())
+    if count < _LEAST_COLUMNS:
+        return _UNSEEN
+    information = np.full(count, 1.0 / (count * _SIGMA_M**2))
+    return Reach(cap.vertex[place[used]], direction[used], distance[used], information)
 
 
 def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Index]:
@@ -166,17 +174,24 @@ def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Ind
     return level, inner[level], end[level]
 
 
-def _edge(depth_m: Image, column: Index, row: Index, out: int, near_m: Array) -> Index:
-    """(n,): the row of the booth's first reading beyond the head's last one; -1 where the gap
-    between them is wide or holds something else, or either is missing."""
+def _ends(
+    depth_m: Image, column: Index, row: Index, out: int, near_m: Array
+) -> tuple[Index, Index]:
+    """(n,) each: the row of the booth's first reading beyond the head's last one, -1 where the gap
+    between them is wide or holds something else; the row of the last one where no booth is."""
     # From inside to outside.
     rows = row[:, None] + out * np.arange(-_REACH_PX, _REACH_PX + 1)
     reading = depth_m[rows, column[:, None]]
     farther = reading - near_m[:, None]
     each = np.arange(len(rows))
-    outer = np.argmax(farther > _BEHIND_M, axis=1)
+    behind = farther > _BEHIND_M
+    outer = np.argmax(behind, axis=1)
     read = np.where(reading > 0.0, np.arange(rows.shape[1]), -1)
+    # Where no booth is, outer is 0, and the last column holds the last reading of all.
     inner = np.maximum.accumulate(read, axis=1)[each, outer - 1]
-    found = (outer > 0) & (inner >= 0) & (outer - inner <= _WIDEST_PX)
-    found &= farther[each, inner] > -_NEARER_M
-    return np.where(found, rows[each, outer], -1)
+    head = (inner >= 0) & (farther[each, inner] > -_NEARER_M)
+    narrow = (outer > 0) & (outer - inner <= _WIDEST_PX)
+    return (
+        np.where(head & narrow, rows[each, outer], -1),
+        np.where(head & ~behind.any(axis=1), rows[each, inner], -1),
+    )

@@ -91,6 +91,8 @@ def fit_surface(
         current = current + step[:, None] * normals
     current = _stood_on_floor(model, current)
     normals = vertex_normals(current, model.faces)
+    # A rim says where the skin ends, not that a camera saw it.
+    noise[len(noise) - len(rims) :] = np.inf
     residual, weight = _gathered(current, normals, followers, noise, *_ROUNDS[-1][:2])
     # A vertex between others that have points is seen as well: the template is finer than pixels.
     seen = (abs(laplacian) @ weight) > 0
