@@ -21,20 +21,14 @@ from workers.scape.deformation import vertex_normals
 from workers.scape.hands import place_hands
 from workers.scape.initial import starting_states
 from workers.scape.intersections import untangled
-from workers.scape.joint import (
-    COARSE,
-    FINE,
-    MIDDLE,
-    JointResult,
-    Target,
-    even_subset,
-    fit_jointly,
-)
+from workers.scape.joint import JointResult, fit_jointly
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
 from workers.scape.paper import fit_like_the_paper
+from workers.scape.pull import Target, even_subset
 from workers.scape.rims import rims_of
 from workers.scape.sampling import Sampling
+from workers.scape.stages import COARSE, FINE, MIDDLE
 from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
     POSSIBLE_HEIGHTS_M,

@@ -16,9 +16,9 @@ from station.errors import InputError
 from station.geometry import rigid_fit, transform
 from workers.scape.correspondence import compatible
 from workers.scape.deformation import vertex_normals
-from workers.scape.joint import Target
 from workers.scape.model import BodyModel, BodyState
 from workers.scape.observer import Observer, unobserved
+from workers.scape.pull import Target
 from workers.scape.surface import SurfaceFit
 
 Array = NDArray[np.float64]
