@@ -15,6 +15,7 @@ from workers.scape.deformation import EdgeSolver, area_vectors, edges, neighbour
 from workers.scape.initial import posed, starting_states
 from workers.scape.kernels import conjugate_gradients, follow, trimmed_costs
 from workers.scape.model import BodyModel, load_model
+from workers.scape.sampled import SampledBody
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
 BALL = sphere((0.1, 0.2, 1.0), 0.3)
@@ -170,7 +171,7 @@ def test_no_points_follow_nothing(dense: bool) -> None:
 
 
 def test_positions_alone_are_those_of_the_derivative(model: BodyModel) -> None:
-    samples = model.at(np.arange(0, model.vertex_count, 211))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, 211))
     rng = np.random.default_rng(4)
     beta = rng.standard_normal(model.beta_count)
     beta[40:] = 0.0
@@ -192,7 +193,7 @@ def test_the_start_has_the_arms_where_the_cloud_has_them(
     state = posed(model, model.neutral_state(), arms_deg, (0.0, 0.0), np.radians(heading_deg))
     vertices = model.vertices(state)
     vertices[:, 2] -= vertices[:, 2].min()
-    scout = model.at(np.arange(0, model.vertex_count, 53))
+    scout = SampledBody.build(model, np.arange(0, model.vertex_count, 53))
     cloud, _ = _skin_points(model, vertices, 800)
     best = model.vertices(starting_states(model, scout, cloud, cloud)[0])
     for side in ("left", "right"):

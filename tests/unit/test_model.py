@@ -9,6 +9,7 @@ import pytest
 from station.errors import FormatError
 from station.geometry import so3_exp
 from workers.scape.model import SHIPPED, BodyModel, BodyState, load_model, save_model
+from workers.scape.sampled import SampledBody
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +34,13 @@ def test_the_neutral_state_is_the_mean_body(model: BodyModel) -> None:
 def test_samples_agree_with_the_whole_body(model: BodyModel) -> None:
     state = _some_state(model)
     chosen = np.arange(0, model.vertex_count, 211)
-    found = model.at(chosen).evaluate(state)
+    found = SampledBody.build(model, chosen).evaluate(state)
     assert np.abs(found - model.vertices(state)[chosen]).max() < 5e-4
 
 
 def test_the_jacobian_is_the_derivative(model: BodyModel) -> None:
     state = _some_state(model)
-    samples = model.at(np.arange(0, model.vertex_count, 211))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, 211))
     before, derivative = samples.jacobian(state)
     delta = 1e-4 * np.random.default_rng(1).standard_normal(derivative.shape[2])
     parts = 3 * model.part_count

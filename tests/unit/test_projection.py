@@ -7,6 +7,7 @@ import pytest
 from workers.scape.model import BodyModel, BodyState, load_model
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.registration import distances, register
+from workers.scape.sampled import SampledBody
 from workers.scape.sampling import Sampling
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
@@ -26,14 +27,14 @@ def _some_state(model: BodyModel) -> BodyState:
 
 
 def test_the_best_fit_finds_a_body_of_the_model(model: BodyModel) -> None:
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     body = model.vertices(_some_state(model))
     found = model.vertices(best_fit(model, samples, body))
     assert np.sqrt(np.mean(np.sum((found - body) ** 2, axis=1))) < 3e-4
 
 
 def test_fewer_components_fit_worse_and_leave_the_others_at_rest(model: BodyModel) -> None:
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     body = model.vertices(_some_state(model))
     errors = []
     for components in (10, 40, model.beta_count):
@@ -44,7 +45,7 @@ def test_fewer_components_fit_worse_and_leave_the_others_at_rest(model: BodyMode
 
 
 def test_the_first_samples_are_the_same_as_all(model: BodyModel) -> None:
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     state = _some_state(model)
     every, few = samples.jacobian(state), samples.first(50).jacobian(state)
     assert np.array_equal(every[0][:50], few[0])
@@ -52,7 +53,7 @@ def test_the_first_samples_are_the_same_as_all(model: BodyModel) -> None:
 
 
 def test_derivatives_of_some_components_are_those_of_all(model: BodyModel) -> None:
-    samples = model.at(np.arange(0, model.vertex_count, 97))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, 97))
     state = _some_state(model)
     positions, every = samples.jacobian(state)
     same, few = samples.jacobian(state, 7)

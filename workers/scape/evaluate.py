@@ -18,6 +18,7 @@ from workers.scape.population import population_table
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.registration import distances, register
 from workers.scape.resources import SAMPLES, measure_resources
+from workers.scape.sampled import SampledBody
 from workers.scape.sampling import Sampling
 
 Array = NDArray[np.float64]
@@ -113,7 +114,7 @@ def _compactness(model: BodyModel) -> Iterator[str]:
 def _neutral(model: BodyModel, bodies: Array) -> Iterator[str]:
     yield "generalisation: held-out bodies in the neutral pose, vertex to vertex"
     yield _HEAD
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     starts = [model.project(body) for body in bodies]
     shipped = np.empty(0)
     for components in sorted({*_COMPONENTS, model.beta_count}):
@@ -145,7 +146,7 @@ def _posed(model: BodyModel, bodies: Array, pictures: Path | None) -> Iterator[s
     )
     found = {}
     for name, variant in (("with Q", model), ("without Q", rigid)):
-        samples = variant.at(every)
+        samples = SampledBody.build(variant, every)
         states = [best_fit(variant, samples, body) for body in bodies]
         errors = np.stack(
             [_away(variant, state, body) for state, body in zip(states, bodies, strict=True)]

@@ -70,7 +70,7 @@ def _hand(model: BodyModel, side: str) -> Hand:
     columns = np.concatenate([np.arange(3 * (p - 1), 3 * p) for p in parts])
     values, vectors = np.linalg.eigh(model.twist_covariance[np.ix_(columns, columns)])
     values[-1] *= _CURL**2
-    body = model.at(mine[order])
+    body = SampledBody.build(model, mine[order])
     return Hand(
         side=side,
         body=body,

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from station.errors import FormatError
 from station.geometry import nearest_rotation, so3_exp, so3_log
 from workers.scape.deformation import EdgeSolver, Faces, Graph, edges, neighbours, vertex_areas
-from workers.scape.sampled import SampledBody
 
 FORMAT = "booth-body-model"
 VERSIONS = frozenset({1})
@@ -235,10 +234,6 @@ class BodyModel:
         areas = vertex_areas(vertices, self.faces)
         shift = areas @ (vertices - placed) / areas.sum()
         return replace(state, translation=state.translation + shift)
-
-    def at(self, indices: NDArray[np.integer[Any]]) -> SampledBody:
-        """The model at sample vertices (n,), with everything that derivatives need, cached."""
-        return SampledBody.build(self, indices)
 
 
 def _inverse(matrices: Array) -> Array:

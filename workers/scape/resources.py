@@ -15,6 +15,7 @@ import numpy as np
 
 from workers.scape.cache import FOLDER_VARIABLE
 from workers.scape.model import load_model
+from workers.scape.sampled import SampledBody
 
 SAMPLES = 3000
 _REPEATS = 15
@@ -56,7 +57,9 @@ def _measured(path: Path | None, folder: str) -> Resources:
     os.environ[FOLDER_VARIABLE] = folder
     start = time.perf_counter(), time.process_time()
     model = load_model(path)
-    samples = model.at(np.linspace(0, model.vertex_count - 1, SAMPLES).astype(np.int64))
+    samples = SampledBody.build(
+        model, np.linspace(0, model.vertex_count - 1, SAMPLES).astype(np.int64)
+    )
     state = model.neutral_state()
     model.vertices(state)
     load = Span(time.perf_counter() - start[0], time.process_time() - start[1])

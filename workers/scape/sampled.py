@@ -11,16 +11,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workers.scape.cache import cached_arrays
 from workers.scape.kernels import add_blocks, add_places
-
-if TYPE_CHECKING:
-    from workers.scape.model import BodyModel, BodyState
+from workers.scape.model import BodyModel, BodyState
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

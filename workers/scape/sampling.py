@@ -43,7 +43,7 @@ class Sampling:
         places = model.mean[order]
         scouts = places[:_SCOUTS]
         scout_of_vertex = cKDTree(scouts).query(model.mean)[1]
-        body = model.at(order)
+        body = SampledBody.build(model, order)
         return cls(
             body,
             body.first(_SCOUTS),

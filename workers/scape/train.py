@@ -15,6 +15,7 @@ from workers.scape.deformation import EdgeSolver, edges, vertex_areas
 from workers.scape.landmarks import find_landmarks
 from workers.scape.model import BodyModel, load_model, save_model
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.sampled import SampledBody
 from workers.scape.skin import separated
 
 Array = NDArray[np.float64]
@@ -227,7 +228,7 @@ def _residual_sigma(model: BodyModel, database: BodyDatabase, plan: TrainingPlan
     shapes = database.sample("validation", plan.residual_bodies, plan.seed)
     poses = database.sample_poses("validation", plan.residual_bodies, plan.seed)
     bodies = database.vertices(shapes, poses)
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     squares = np.zeros(model.vertex_count)
     for body in bodies:
         squares += np.square(model.vertices(best_fit(model, samples, body)) - body).sum(axis=1)
