@@ -199,6 +199,15 @@ def _bumped(seen: Observations, camera: str) -> Observations:
     return _balls(seen, turned)
 
 
+def _head_on_mark(seen: Observations) -> Observations:
+    """What one camera took for the resting ball is as high as a head, and nobody saw the floor."""
+    highest = min(
+        (ball for ball in seen.balls if ball.camera == "back-upper"),
+        key=lambda ball: float(ball.center_m[1] / ball.center_m[2]),
+    )
+    return replace(seen, mark=[highest] * 15, planes=[])
+
+
 def _scattering(seen: Observations, camera: str) -> Observations:
     rng = np.random.default_rng(5)
 
@@ -228,6 +237,7 @@ FAULTS = (
     Fault("another ball", lambda seen: seen, "the ball measures 100 mm in radius", 0.11),
     Fault("too short", lambda seen: _near(seen, 14.0), "camera "),
     Fault("nothing on the mark", lambda seen: replace(seen, mark=()), "on the mark"),
+    Fault("a head above the mark", _head_on_mark, "below the floor"),
     Fault("no floor", lambda seen: replace(seen, planes=(), around={}), "the floor"),
     Fault(
         "no floor, and the ball on one line",

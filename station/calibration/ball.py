@@ -29,7 +29,6 @@ from station.depth.points import project, rays
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _RANGE_M = (0.5, 3.5)
 _FOREGROUND = 0.02
@@ -99,7 +98,6 @@ class _Fit:
     center_m: Array
     covariance_m2: Array
     pixels: int
-    visible: float
     radius_m: float
     radius_sigma_m: float
     patches: Array
@@ -161,7 +159,6 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
         center_m=center,
         covariance_m2=np.linalg.inv(normal[:3, :3]),
         pixels=int(used),
-        visible=used / seen,
         radius_m=float(free_radius),
         radius_sigma_m=radius_sigma,
         patches=patches,

@@ -87,7 +87,10 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
 
 
 def _list(procedure: Procedure) -> None:
-    for entry in procedure.store.entries():
+    entries = list(procedure.store.entries())
+    if not entries:
+        click.echo("no calibration yet; station calibrate makes one")
+    for entry in entries:
         mark = "*" if entry.in_use else " "
         click.echo(
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "

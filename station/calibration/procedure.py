@@ -64,6 +64,8 @@ class Procedure:
         session = self.begun()
         if session is not None:
             self.guide.say(f"going on with the calibration that was begun {session.started}")
+            if session.done(MARK):
+                self.guide.say("  the ball on the mark was seen; station calibrate mark: anew")
         if session is None or not session.done(EMPTY):
             self.empty()
         if session is None or not covered(session, self.config.reference).enough:

@@ -158,6 +158,16 @@ def check_slope(placed: Placed) -> None:
         )
 
 
+def check_upright(placed: Placed) -> None:
+    for name, pose in placed.world_from_camera.items():
+        if pose[2, 3] < 0.0:
+            raise CalibrationError(
+                f"camera {name} comes out {-pose[2, 3]:.2f} m below the floor: what was taken for "
+                "the ball on the mark was something else; leave the booth, lay the ball on the "
+                "mark, and run station calibrate mark"
+            )
+
+
 def check_mark(placed: Placed, radius_m: float) -> None:
     off = placed.mark_height_m - radius_m
     if abs(off) > _MARK_TOLERANCE_M:

@@ -159,6 +159,7 @@ def solve(
     placed = world.place(problem, state, front_cameras)
     refusals.check_sigma(placed, reference, covered)
     refusals.check_slope(placed)
+    refusals.check_upright(placed)
     refusals.check_mark(placed, radius_m)
     rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
     weak = [] if covered.enough else [covered.advice()]

@@ -21,7 +21,7 @@ class AveragedDepth:
 
     depth_m: NDArray[np.float32]
     """Mean of the readings near their median; 0 where too few agree."""
-    count: NDArray[np.uint8]
+    count: NDArray[np.uint16]
     """How many readings the mean is of."""
     unsettled_m: NDArray[np.float32]
     """Median where two or more readings lie far from it, as on a body that moved; 0 elsewhere."""
@@ -43,7 +43,7 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
     frames = len(stack)
     least = max(1, int(np.ceil(0.4 * frames)))
     depth = np.zeros(stack.shape[1:], np.float32)
-    count = np.zeros(stack.shape[1:], np.uint8)
+    count = np.zeros(stack.shape[1:], np.uint16)
     change = np.full(stack.shape[1:], np.nan, np.float32)
     unsettled = np.zeros(stack.shape[1:], np.float32)
     third = max(1, frames // 3)
@@ -56,11 +56,11 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
     """Row by row: what is done to all pixels of a row alike runs in vector registers."""
     frames, height, width = stack.shape
     ordered = np.empty((frames, width), np.uint16)
-    read = np.empty(width, np.uint8)
+    read = np.empty(width, np.uint16)
     median, gate = np.empty((2, width), np.float32)
     # Each under a name of its own: rows by index would keep the compiler from vector registers.
     total, early, late = np.empty((3, width), np.float32)
-    kept, kept_early, kept_late = np.empty((3, width), np.uint8)
+    kept, kept_early, kept_late = np.empty((3, width), np.uint16)
     for y in range(height):
         _sort(stack, y, ordered, read)
         for x in range(width):

@@ -34,6 +34,7 @@ _SECOND_PERSON_HEIGHT_M = 1.1
 _PEOPLE_STRIDE = 4
 _MOTION_M = 0.010
 _MOTION_STRIDE = 4
+_LEAST_MOVING = 125
 """Neighbours moved alike."""
 _UNSETTLED_SHARE = 0.25
 _PLENTY_OF_FRAMES = 10
@@ -100,6 +101,7 @@ class Preprocessed:
 
     cloud: PointCloud
     views: tuple[CameraView, ...]
+    """Empty for a bare cloud, else one of each of its cameras, in their order."""
     findings: tuple[Finding, ...]
 
 
@@ -312,7 +314,7 @@ def _motion(camera: _Camera, keep: Mask) -> float:
     The depth changes are explained by one shift t: n . t = (n . ray) change, in least squares.
     """
     chosen = np.flatnonzero(keep & np.isfinite(camera.change_m))[::_MOTION_STRIDE]
-    if len(chosen) < 125:
+    if len(chosen) < _LEAST_MOVING:
         return 0.0
     pose = camera.calibration.world_from_camera
     offsets = camera.points[chosen] - pose[:3, 3]

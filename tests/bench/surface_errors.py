@@ -11,11 +11,10 @@ from scipy.spatial import cKDTree
 
 from station.drivers.virtual_scene import Mesh
 from workers.scape.deformation import vertex_areas
-from workers.scape.model import BodyModel
+from workers.scape.model import HAND, BodyModel
 
 Array = NDArray[np.float64]
 
-_HAND = ("hand", "thumb", "fingers")
 _EXTREMITIES = ("hand", "foot")
 
 
@@ -77,7 +76,7 @@ def surface_errors(
 
 def _operators_name(part: str) -> str:
     stem, _, side = part.rpartition("_")
-    return f"hand_{side}" if stem in _HAND else part
+    return f"hand_{side}" if stem in HAND else part
 
 
 def _rms(away: Array, area: Array, chosen: NDArray[np.bool_]) -> float:

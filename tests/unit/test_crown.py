@@ -9,7 +9,14 @@ import pytest
 
 from station.depth import CameraView, PointCloud
 from station.depth.points import rays
-from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, default_rig, rod
+from station.drivers.virtual_scene import (
+    Mesh,
+    VirtualScene,
+    booth_walls,
+    default_rig,
+    rod,
+    sphere,
+)
 from station.geometry import rigid, so3_exp, transform
 from workers.scape.cameras import CameraCorrections
 from workers.scape.crown import Reach, reach
@@ -111,6 +118,13 @@ def test_a_stick_above_the_head_is_not_its_end(model: BodyModel, body: np.ndarra
     stick = rod((x - 0.3, y, z + 0.03), (x + 0.3, y, z + 0.03), 0.004)
     found = _reach(model, _view(model, body, beside=[stick]), body)
     assert np.mean(found.distance_m) == pytest.approx(0.0, abs=0.0015)
+
+
+def test_a_bun_on_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:
+    x, y, z = body[np.argmax(body[:, 2])]
+    for radius in (0.025, 0.04):
+        bun = sphere((x, y + 0.02, z + 0.2 * radius), radius)
+        assert not len(_reach(model, _view(model, body, beside=[bun]), body).vertex)
 
 
 def test_a_head_beyond_the_image_is_no_crown(model: BodyModel, body: np.ndarray) -> None:

@@ -43,6 +43,7 @@ class CameraCorrections:
         by_name = {view.name: view.calibration for view in views}
         if not by_name:
             return cls(np.empty((0, 3)), np.empty((0, 6, 6)), np.empty((0, 6)))
+        assert tuple(by_name) == cloud.camera_names, "views in the order of the cloud's cameras"
         believed = np.diag([_TURN_SIGMA_RAD**2] * 3 + [_SHIFT_SIGMA_M**2] * 3)
         eyes, information = [], []
         for name in cloud.camera_names:

@@ -41,6 +41,8 @@ _NEARER_M = 0.12
 _BEYOND_M = 0.0045
 """So much of a head lies beyond its last reading: a Kinect reads up to 70 or 75 degrees of
 incidence, beyond which a radius of 8 to 12 cm leaves 3 to 7 mm."""
+_FARTHEST_M = 0.012
+"""No shape leaves a head off by so much: what is seen to end there is a bun, a hat, a hand."""
 _LEAST_COLUMNS = 6
 _SIGMA_M = 0.0015
 """Of one camera's word, however many columns it has: half a pixel, or 0.05 degrees of its pose."""
@@ -138,7 +140,7 @@ def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
         if not used.any() or np.median(distance[used]) < 0.0:
             return _UNSEEN
     count = int(used.sum())
-    if count < _LEAST_COLUMNS:
+    if count < _LEAST_COLUMNS or abs(np.median(distance[used])) > _FARTHEST_M:
         return _UNSEEN
     information = np.full(count, 1.0 / (count * _SIGMA_M**2))
     return Reach(cap.vertex[place[used]], direction[used], distance[used], information)

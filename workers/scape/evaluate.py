@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from station.errors import FormatError
 from workers.scape.database import BodyDatabase
 from workers.scape.deformation import vertex_areas
-from workers.scape.model import BodyModel, BodyState, load_model
+from workers.scape.model import HAND, BodyModel, BodyState, load_model
 from workers.scape.pictures import draw_case, draw_components
 from workers.scape.population import population_table
 from workers.scape.projection import PROJECTION_STRIDE, best_fit
@@ -27,7 +27,7 @@ _COMPONENTS = (10, 20, 40, 60, 80, 100, 130, 160)
 _POPULATION = 400
 _RANDOM_BODIES = 20
 _DRAWN_COMPONENTS = 5
-_EXTREMITIES = ("hand", "thumb", "fingers", "foot")
+_EXTREMITIES = (*HAND, "foot")
 
 
 @dataclass(frozen=True, slots=True)

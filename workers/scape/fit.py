@@ -132,7 +132,11 @@ def one_thread_in_blas() -> threadpool_limits:
 def lay_body(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
 ) -> LaidBody:
-    """The first part of `fit_body`, after which a body can be measured."""
+    """The first part of `fit_body`, after which a body can be measured.
+
+    Raises:
+        InputError: the cloud holds no body that could be fitted.
+    """
     cloud = scan.cloud
     _refuse_absurd(cloud)
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})

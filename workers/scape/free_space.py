@@ -57,7 +57,7 @@ class FreeSpace:
     @classmethod
     def build(cls, views: Sequence[CameraView]) -> FreeSpace:
         with ThreadPoolExecutor(max_workers=2) as pool:
-            found = pool.map(_view, (view for view in views))
+            found = pool.map(_view, views)
             return cls(tuple(found))
 
     def intrusions(self, poses: Sequence[Array], vertices: Array) -> Intrusions:

@@ -54,7 +54,7 @@ class Hand:
     mean: Array
     """(9,): prior twists of the parts, radians."""
     spread: Array
-    """(9, 9): a square root of their covariance."""
+    """(9, 9): a square root of their covariance, wider the way fingers close."""
 
 
 def hands_of(model: BodyModel) -> tuple[Hand, ...]:
