@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from station.depth import PointCloud
 from station.errors import InputError
@@ -17,6 +18,16 @@ Faces = NDArray[np.int32]
 
 _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
+_ASKED, _OTHERS = 25_000, 12_000
+"""Points that look for a body's other side, and among which."""
+_DEPTHS_M = (0.06, 0.09, 0.13, 0.18, 0.24, 0.30)
+"""How thick a body is, from forearms to trunks."""
+_WIDENING, _SPACING_M = 0.25, 0.01
+"""How far beside a normal the other side may lie: it is slanted, and sampled."""
+_NEARNESS_M = 0.15
+"""What lies nearer counts more: farther away there may be another limb."""
+_VOTERS, _ROUNDS = 30, 8
+_AGREED = 0.8
 _SIGMA_M = 0.001
 _UNSEEN_SOLES_M = 0.03
 """A cloud that begins so little above its own z = 0 stands there: cameras see no soles."""
@@ -51,6 +62,8 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     if not cloud.has_normals():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
         cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
+        normals = _outwards(np.asarray(cloud.points), np.asarray(cloud.normals))
+        cloud.normals = o3d.utility.Vector3dVector(normals)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     if up == "y":
         points, normals = points[:, [0, 2, 1]] * (1, -1, 1), normals[:, [0, 2, 1]] * (1, -1, 1)
@@ -68,6 +81,46 @@ def read_cloud(path: Path, up: str) -> PointCloud:
         camera_names=("cloud",),
         origin_m=(x, y, z),
     )
+
+
+def _outwards(points: Array, normals: Array) -> Array:
+    """Normals (n, 3) that look out of a body, of some that agree with their neighbours already.
+
+    In the gaps between what two scanners saw such an agreement is lost: one side may then be turned
+    in while the other looks out. Where that is so, each is turned by what lies behind it.
+    """
+    turned = _turned_outwards(points, normals)
+    share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
+    if share > _AGREED:
+        return normals
+    return -normals if share < 1.0 - _AGREED else turned
+
+
+def _turned_outwards(points: Array, normals: Array) -> Array:
+    """Normals (n, 3) of a body's points (n, 3), each turned out of it.
+
+    Behind the skin lies the body's other side, before it nothing or another limb, farther away.
+    Neighbours vote; between limbs and on hands it fails.
+    """
+    chosen = slice(None, None, max(1, len(points) // _ASKED))
+    asked, directions = points[chosen], normals[chosen]
+    others = cKDTree(points[:: max(1, len(points) // _OTHERS)])
+    outside = np.zeros(len(asked))
+    for depth_m in _DEPTHS_M:
+        gap_m = _WIDENING * depth_m + _SPACING_M
+        for side in (1.0, -1.0):
+            place = asked + side * depth_m * directions
+            away = others.query(place, distance_upper_bound=gap_m, workers=-1)[0]
+            outside -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
+    tree = cKDTree(asked)
+    voters = tree.query(asked, min(_VOTERS, len(asked)), workers=-1)[1]
+    outwards = np.sign(outside)[:, None] * directions
+    for _ in range(_ROUNDS):
+        agreed = np.einsum("ni,ni->n", outwards[voters].sum(axis=1), directions) >= 0.0
+        outwards = np.where(agreed[:, None], directions, -directions)
+    mine = outwards[tree.query(points, workers=-1)[1]]
+    agrees = np.einsum("ni,ni->n", mine, normals) >= 0.0
+    return np.where(agrees[:, None], normals, -normals)
 
 
 def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:

@@ -13,6 +13,7 @@ import pytest
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, preprocess
 from station.geometry import so3_exp
+from workers.point_cloud import _outwards, read_cloud
 from workers.scape.deformation import vertex_normals
 from workers.scape.fit import FitResult, fit_body
 from workers.scape.intersections import self_intersections, turned_over
@@ -108,6 +109,24 @@ def test_a_person_may_face_any_way(model: BodyModel, bundle: Path, turn_deg: flo
     truth = np.load(BODIES / "ben.npz")["vertices"] @ turn.T
     away = _distance_to(fit.vertices, model.faces, truth)
     assert np.sqrt(np.mean(away**2)) < 0.004
+    assert fit.verdict.status == "ok"
+
+
+def test_a_cloud_without_normals_and_with_gaps_is_fitted(
+    model: BodyModel, bundle: Path, tmp_path: Path
+) -> None:
+    """Front and back cameras see two sheets; which side of them is out only their distance says."""
+    seen = preprocess(read_bundle(bundle)).cloud
+    bare = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen.points))
+    o3d.io.write_point_cloud(tmp_path / "bare.ply", bare)
+    cloud = read_cloud(tmp_path / "bare.ply", "z")
+    assert np.mean(np.einsum("ni,ni->n", cloud.normals, seen.normals) > 0.0) > 0.95
+    ahead = np.where(seen.normals[:, 1] < 0.0, 1.0, -1.0)[:, None]
+    outwards = _outwards(seen.points, ahead * seen.normals)
+    assert np.mean(np.einsum("ni,ni->n", outwards, seen.normals) > 0.0) > 0.95
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    truth = np.load(BODIES / "ben.npz")["vertices"] - cloud.origin_m
+    assert np.sqrt(np.mean(_distance_to(fit.vertices, model.faces, truth) ** 2)) < 0.004
     assert fit.verdict.status == "ok"
 
 
