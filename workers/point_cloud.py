@@ -89,6 +89,8 @@ def _outwards(points: Array, normals: Array) -> Array:
     In the gaps between what two scanners saw such an agreement is lost: one side may then be turned
     in while the other looks out. Where that is so, each is turned by what lies behind it.
     """
+    if len(points) < _VOTERS:
+        return normals
     turned = _turned_outwards(points, normals)
     share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
     if share > _AGREED:
@@ -113,7 +115,7 @@ def _turned_outwards(points: Array, normals: Array) -> Array:
             away = others.query(place, distance_upper_bound=gap_m, workers=-1)[0]
             outside -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
     tree = cKDTree(asked)
-    voters = tree.query(asked, min(_VOTERS, len(asked)), workers=-1)[1]
+    voters = tree.query(asked, _VOTERS, workers=-1)[1]
     outwards = np.sign(outside)[:, None] * directions
     for _ in range(_ROUNDS):
         agreed = np.einsum("ni,ni->n", outwards[voters].sum(axis=1), directions) >= 0.0
