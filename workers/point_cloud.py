@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from station.depth import PointCloud
 from station.errors import InputError
-from workers.scape.verdict import POSSIBLE_HEIGHTS_M
+from workers.scape.verdict import LEAST_POINTS, POSSIBLE_HEIGHTS_M
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -54,6 +54,8 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     points = np.asarray(cloud.points)
     if not len(points):
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
+    if len(points) < LEAST_POINTS:
+        raise InputError(f"{path} has {len(points)} points; a body needs {LEAST_POINTS}")
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not numbers; repair it")
     if len(points) > _MOST_POINTS:
@@ -61,7 +63,10 @@ def read_cloud(path: Path, up: str) -> PointCloud:
         cloud = cloud.select_by_index(np.sort(kept))
     if not cloud.has_normals():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
-        cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
+        try:
+            cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
+        except RuntimeError as error:
+            raise InputError(f"{path} is flat; a body has a front and a back") from error
         normals = _outwards(np.asarray(cloud.points), np.asarray(cloud.normals))
         cloud.normals = o3d.utility.Vector3dVector(normals)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
@@ -89,8 +94,6 @@ def _outwards(points: Array, normals: Array) -> Array:
     In the gaps between what two scanners saw such an agreement is lost: one side may then be turned
     in while the other looks out. Where that is so, each is turned by what lies behind it.
     """
-    if len(points) < _VOTERS:
-        return normals
     turned = _turned_outwards(points, normals)
     share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
     if share > _AGREED:

@@ -6,6 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from station.errors import InputError
 from workers import point_cloud
 from workers.point_cloud import read_cloud
 
@@ -18,7 +19,7 @@ def _written(path: Path, points: np.ndarray) -> Path:
 
 
 def test_a_cloud_goes_back_to_where_it_was(tmp_path: Path) -> None:
-    points = np.random.default_rng(1).uniform((1.0, 5.0, -3.0), (2.0, 6.0, -1.0), (500, 3))
+    points = np.random.default_rng(1).uniform((1.0, 5.0, -3.0), (2.0, 6.0, -1.0), (2000, 3))
     cloud = read_cloud(_written(tmp_path / "a.ply", points), "z")
     assert np.allclose(cloud.points + cloud.origin_m, points, atol=1e-6)
     assert cloud.points[:, 2].min() == 0.0
@@ -39,7 +40,20 @@ def test_soles_that_no_camera_saw_are_not_the_floor(
     tmp_path: Path, low_m: float, floor_m: float
 ) -> None:
     """Our own cloud.ply begins a centimetre above the floor it stands on."""
-    points = np.random.default_rng(1).uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 1.7), (500, 3))
+    points = np.random.default_rng(1).uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 1.7), (2000, 3))
     points[:, 2] += low_m - points[:, 2].min()
     cloud = read_cloud(_written(tmp_path / "cloud.ply", points), "z")
     assert cloud.origin_m[2] == pytest.approx(floor_m, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("count", "depth_m", "words"), [(3, 0.3, "a body needs"), (3000, 0.0, "is flat")]
+)
+def test_what_can_be_no_body_is_refused(
+    tmp_path: Path, count: int, depth_m: float, words: str
+) -> None:
+    points = np.random.default_rng(0).uniform(0.0, (0.5, depth_m, 1.7), (count, 3))
+    path = tmp_path / "odd.ply"
+    o3d.io.write_point_cloud(path, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+    with pytest.raises(InputError, match=words):
+        read_cloud(path, "z")

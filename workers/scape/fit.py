@@ -31,6 +31,7 @@ from workers.scape.sampling import Sampling
 from workers.scape.stages import COARSE, FINE, MIDDLE
 from workers.scape.surface import SurfaceFit, fit_surface
 from workers.scape.verdict import (
+    LEAST_POINTS,
     POSSIBLE_HEIGHTS_M,
     PartReport,
     Verdict,
@@ -44,7 +45,6 @@ Array = NDArray[np.float64]
 Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
-_LEAST_POINTS = 1500
 _TREE_POINTS = 30_000
 _COARSE_POINTS = 800
 _SCOUT_SAMPLES = 250
@@ -279,8 +279,8 @@ def _report(progress: Progress, before: float, share: float, of_schedule: float)
 def _refuse_absurd(cloud: PointCloud) -> None:
     if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.normals).all()):
         raise InputError("the cloud holds values that are not numbers; repair or scan again")
-    if len(cloud) < _LEAST_POINTS:
-        raise InputError(f"the cloud has {len(cloud)} points; a body needs {_LEAST_POINTS}")
+    if len(cloud) < LEAST_POINTS:
+        raise InputError(f"the cloud has {len(cloud)} points; a body needs {LEAST_POINTS}")
     height_m = float(np.ptp(cloud.points[:, 2]))
     if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(

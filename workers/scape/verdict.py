@@ -24,6 +24,8 @@ _LOST_POINTS_SHARE = 0.001
 _UNMET_SHARE = 0.15
 _CAMERA_SHIFT_M = 0.002
 """Rightly placed cameras are moved by tenths of a millimetre, one that is 5 mm off by 3 or more."""
+LEAST_POINTS = 1500
+"""Of a cloud that shows a body."""
 POSSIBLE_HEIGHTS_M = (1.0, 2.6)
 """What is lower or higher is not a standing person in metres at all."""
 _STATURE_M = (1.30, 2.25)
