@@ -67,7 +67,7 @@ def read_cloud(path: Path, up: str) -> PointCloud:
             cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
         except RuntimeError as error:
             raise InputError(f"{path} is flat; a body has a front and a back") from error
-        normals = _outwards(np.asarray(cloud.points), np.asarray(cloud.normals))
+        normals = _consistent(np.asarray(cloud.points), np.asarray(cloud.normals))
         cloud.normals = o3d.utility.Vector3dVector(normals)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     if up == "y":
@@ -88,17 +88,16 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     )
 
 
-def _outwards(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) that look out of a body, of some that agree with their neighbours already.
+def _consistent(points: Array, normals: Array) -> Array:
+    """Normals (n, 3) that all look out of a body or all into it, of some that agree with their
+    neighbours.
 
     In the gaps between what two scanners saw such an agreement is lost: one side may then be turned
     in while the other looks out. Where that is so, each is turned by what lies behind it.
     """
     turned = _turned_outwards(points, normals)
     share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
-    if share > _AGREED:
-        return normals
-    return -normals if share < 1.0 - _AGREED else turned
+    return turned if 1.0 - _AGREED < share < _AGREED else normals
 
 
 def _turned_outwards(points: Array, normals: Array) -> Array:

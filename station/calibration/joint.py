@@ -45,7 +45,7 @@ _GATE = 11.3
 _REJECT = 60.0
 _LEAST_TYPICAL = 0.2
 """Of the noise's variance."""
-_MEDIAN = 2.366
+MEDIAN = 2.366
 """Of the squared deviation of three numbers."""
 
 
@@ -301,7 +301,7 @@ def _robust_weight(deviation: Array) -> Array:
     Once they are most deviate by less than the noise that is assumed: fingers over the ball then
     show, although they deviate by no more than that noise could.
     """
-    typical = max(float(np.median(deviation)) / _MEDIAN, _LEAST_TYPICAL)
+    typical = max(float(np.median(deviation)) / MEDIAN, _LEAST_TYPICAL)
     deviation = deviation / typical
     far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
     return np.where(deviation < _REJECT, far, 0.0)

@@ -12,6 +12,7 @@ from station.calibration.acceptance import HeldOut
 from station.calibration.coverage import Coverage
 from station.calibration.detections import BallDetection, Observations
 from station.calibration.initial import Detections
+from station.calibration.joint import MEDIAN
 from station.calibration.pairwise import Pair
 from station.calibration.problem import State
 from station.calibration.world import Placed
@@ -113,7 +114,7 @@ def check_tied(cameras: Iterable[str], poses: Mapping[str, Array]) -> None:
 
 def check_scatter(state: State) -> None:
     for name, deviation in state.deviations.items():
-        scatter = float(np.sqrt(np.median(deviation) / 2.366)) if len(deviation) else 0.0
+        scatter = float(np.sqrt(np.median(deviation) / MEDIAN)) if len(deviation) else 0.0
         if scatter > _LARGEST_SCATTER:
             raise CalibrationError(
                 f"camera {name} scatters {scatter:.1f} times as much as a sound sensor does: let "

@@ -11,17 +11,17 @@ from station.calibration.ball import find_ball
 from station.calibration.detections import BallDetection, Observations, PlaneObservation
 from station.calibration.planes import observe_floor, observe_wall
 from station.calibration.rig import CameraCalibration
-from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.clock import DeviceClock
 from station.depth.average import average
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual import FRAME_RATE_HZ, TICK_HZ
+from station.drivers.virtual import TICK_HZ
 from station.drivers.virtual_calibration import (
     AROUND,
     BALL,
     EMPTY,
     FRONT,
     MARK,
+    STRIDE,
     VirtualProcedure,
 )
 
@@ -31,7 +31,6 @@ _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
 _LOOK_S = 1.0
 """At the ball on the floor, and at the board."""
-_STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
 
 
 def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observations:
@@ -58,7 +57,7 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
             find_ball(
                 depth * np.float32(DEPTH_SCALE_M), camera, procedure.radius_m, time_s, background
             )
-            for time_s, depth in timed(step, limit_s, _STRIDE)
+            for time_s, depth in timed(step, limit_s, STRIDE)
         )
         return [detection for detection in found if detection is not None]
 

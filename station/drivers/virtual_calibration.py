@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.drivers.virtual import (
     FRAME_RATE_HZ,
     SimulatedBooth,
@@ -24,6 +25,8 @@ from station.errors import InputError
 Array = NDArray[np.float64]
 
 EMPTY, BALL, MARK, FRONT, AROUND = "empty", "ball", "mark", "front", "around"
+STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
+"""No more frames of a ball are looked at."""
 _REST_S = 2.0
 _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""

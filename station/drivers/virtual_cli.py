@@ -10,23 +10,19 @@ from pathlib import Path
 
 import click
 
-from station.calibration.sensor_noise import INDEPENDENT_HZ
 from station.drivers.virtual import (
-    FRAME_RATE_HZ,
     TICK_HZ,
     SimulatedBooth,
     VirtualCamera,
     recorded_frames,
 )
-from station.drivers.virtual_calibration import EMPTY, VirtualProcedure
+from station.drivers.virtual_calibration import EMPTY, STRIDE, VirtualProcedure
 from station.drivers.virtual_scene import fixed_posts, load_mesh
 from station.recording import RecordedFrame, write_recording
 
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error where a calibration has to find it."""
-_STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
-"""No more frames are looked at, but of the empty booth: the floor is hardly seen."""
 _BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 
@@ -114,7 +110,8 @@ def _record_person(
 
 
 def _record_step(procedure: VirtualProcedure, name: str, step: str, folder: Path) -> int:
-    stride = 1 if step == EMPTY else _STRIDE
+    # In the empty booth the floor is hardly seen: each frame counts.
+    stride = 1 if step == EMPTY else STRIDE
     return write_recording(folder, _frames_of(procedure, name, step, stride), tick_hz=TICK_HZ)
 
 

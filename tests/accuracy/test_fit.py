@@ -13,7 +13,7 @@ import pytest
 from station.bundle import read_bundle
 from station.depth import PointCloud, Preprocessed, preprocess
 from station.geometry import so3_exp
-from workers.point_cloud import _outwards, read_cloud
+from workers.point_cloud import _consistent, read_cloud
 from workers.scape.deformation import vertex_normals
 from workers.scape.fit import FitResult, fit_body
 from workers.scape.intersections import self_intersections, turned_over
@@ -122,7 +122,7 @@ def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     cloud = read_cloud(tmp_path / "bare.ply", "z")
     assert np.mean(np.einsum("ni,ni->n", cloud.normals, seen.normals) > 0.0) > 0.95
     ahead = np.where(seen.normals[:, 1] < 0.0, 1.0, -1.0)[:, None]
-    outwards = _outwards(seen.points, ahead * seen.normals)
+    outwards = _consistent(seen.points, ahead * seen.normals)
     assert np.mean(np.einsum("ni,ni->n", outwards, seen.normals) > 0.0) > 0.95
     fit = fit_body(model, Preprocessed(cloud, (), ()))
     truth = np.load(BODIES / "ben.npz")["vertices"] - cloud.origin_m

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from station.depth import CameraView
@@ -104,11 +105,9 @@ def _cap(model: BodyModel, vertices: Array) -> _Cap:
 @lru_cache(maxsize=2)
 def _head(model: BodyModel) -> tuple[Index, Index]:
     """The head's vertices, and the edges (e, 2) between them."""
-    head = model.part_of_vertex == model.part_names.index("head")
-    faces = model.faces[head[model.faces].all(axis=1)]
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    used, ends = np.unique(edges, return_inverse=True)
-    return used.astype(np.intp), ends.reshape(-1, 2).astype(np.intp)
+    head = np.flatnonzero(model.part_of_vertex == model.part_names.index("head"))
+    ends = sp.triu(model.adjacency[head][:, head]).nonzero()
+    return head, np.stack(ends, axis=1).astype(np.intp)
 
 
 def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:

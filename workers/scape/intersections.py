@@ -145,7 +145,5 @@ def _grown(mask: Mask, mean: sp.csr_matrix, rings: int) -> Mask:
 @lru_cache(maxsize=2)
 def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
     """(P, P): takes values to the means of their neighbours'."""
-    linked = abs(model.solver.laplacian).sign()
-    linked = (linked - sp.diags(linked.diagonal())).tocsr()
-    linked.eliminate_zeros()
+    linked = model.adjacency
     return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()

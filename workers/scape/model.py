@@ -105,6 +105,12 @@ class BodyModel:
         return np.flatnonzero([name.rpartition("_")[0] in HAND for name in self.part_names])
 
     @cached_property
+    def adjacency(self) -> sp.csr_matrix:
+        """(P, P): 1 where an edge joins two vertices."""
+        first, columns = self.neighbours
+        return sp.csr_matrix((np.ones(len(columns)), columns, first))
+
+    @cached_property
     def solver(self) -> EdgeSolver:
         return EdgeSolver.build(self.mean, self.faces)
 

@@ -105,10 +105,8 @@ def fit_surface(
 def _membrane(model: BodyModel) -> sp.csr_matrix:
     """L (P, P), the graph's: in two dimensions a membrane is as stiff in small triangles as in
     large ones, so that ears and lips do not follow noise."""
-    pattern = abs(model.solver.laplacian).sign()
-    pattern = pattern - sp.diags(pattern.diagonal())
-    degree = np.asarray(pattern.sum(axis=1)).ravel()
-    return (sp.diags(degree) - pattern).tocsr()
+    degree = np.asarray(model.adjacency.sum(axis=1)).ravel()
+    return (sp.diags(degree) - model.adjacency).tocsr()
 
 
 def _gathered(
