@@ -52,12 +52,14 @@ def start(config_path: Path | None, timeout_s: float) -> None:
     """
     config = load_config(find_config(config_path))
     _command(config, Request("start"))
-    deadline_s = time.monotonic() + timeout_s
+    began_s = time.monotonic()
+    deadline_s = began_s + timeout_s
     troubles: dict[str, str] = {}
     while True:
         sync = _command(config, Request("status"))["sync"]
         silent = sync.get("silent", [camera.name for camera in config.cameras])
-        if not silent:
+        # A camera whose process has just died counts as silent only after a while.
+        if not silent and time.monotonic() - began_s > config.sync.silent_after_s:
             break
         for name in silent:
             detail = sync.get("cameras", {}).get(name, {}).get("detail")
