@@ -6,20 +6,22 @@ with the sensor's noise; no arm, no false detections. For tests of the solution 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration import depth_correction
+from station.calibration.depth_correction import MIDDLE, correction_of
 from station.calibration.detections import FLOOR, BallDetection, Observations, PlaneObservation
 from station.calibration.joint import ball_inverse_depth, local_equations
 from station.calibration.problem import Sightings
-from station.calibration.rig import CameraCalibration, Rig
+from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
 from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
 from station.drivers.virtual import FRAME_RATE_HZ, SimulatedBooth, SimulatedUnit
 from station.drivers.virtual_calibration import AROUND, BALL, VirtualProcedure
+from station.drivers.virtual_noise import UnitError
 from station.drivers.virtual_scene import default_rig
 from station.geometry import invert, se3_exp, transform
 
@@ -40,7 +42,8 @@ def booth(seed: int, bias_m: float = 0.015) -> SimulatedBooth:
         )
         for name, camera in rig.cameras.items()
     }
-    return SimulatedBooth(rig=replace(rig, cameras=cameras), seed=seed, bias_m=bias_m)
+    rig = replace(rig, cameras=cameras)
+    return SimulatedBooth(rig=rig, seed=seed, bias_m=bias_m, uneven_m=5e-4)
 
 
 def factory(rig: Rig) -> dict[str, CameraCalibration]:
@@ -48,6 +51,14 @@ def factory(rig: Rig) -> dict[str, CameraCalibration]:
     return {
         name: replace(camera, world_from_camera=np.eye(4)) for name, camera in rig.cameras.items()
     }
+
+
+def true_correction(error: UnitError) -> DepthCorrection:
+    """What undoes a unit's depth error."""
+    shift = 0.25 * error.bias_m
+    tilt_x, tilt_y = error.tilt
+    parameters = (shift, error.gain, error.curvature, shift * tilt_x, shift * tilt_y)
+    return correction_of(np.array(parameters))
 
 
 def observations(
@@ -79,14 +90,29 @@ def observations(
     )
 
 
+def detections(
+    procedure: VirtualProcedure, cameras: Sequence[str], center_m: Array, time_s: float
+) -> list[BallDetection]:
+    """What some cameras see, at one time, of something as round as the ball."""
+    rng = np.random.default_rng((procedure.booth.seed, round(1e3 * time_s)))
+    found = []
+    for name in cameras:
+        unit = SimulatedUnit.of(procedure.booth, name)
+        seen = _ball(procedure.booth.rig.cameras[name], unit, center_m, procedure, rng)
+        if seen is not None:
+            found.append(replace(seen, time_s=time_s))
+    return found
+
+
 def _measured(
     unit: SimulatedUnit, camera: CameraCalibration, u: Array, v: Array, w: Array
 ) -> Array:
     """Inverse depths as the unit reports them, its error written down once more."""
-    error, depth = unit.error, 1.0 / w
+    error = unit.error
     x, y = 2.0 * u / (camera.width - 1) - 1.0, 2.0 * v / (camera.height - 1) - 1.0
     tilted = 1.0 + error.tilt[0] * x + error.tilt[1] * y
-    return np.asarray(1.0 / (depth + error.bias_m * tilted * (depth / 2.0) ** 2))
+    shift = 0.25 * error.bias_m * tilted
+    return np.asarray(w - shift - error.gain * w - error.curvature * (w - MIDDLE) ** 2)
 
 
 def _ball(

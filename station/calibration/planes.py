@@ -28,7 +28,9 @@ _HEIGHT_M = (0.15, 3.5)
 _INCIDENCE_COSINE = 0.26
 """75 degrees: a camera at hip height sees the floor at a slant, if at all."""
 _UNEVEN_M = 5e-4
-"""How flat floors and boards are over a cell."""
+"""How far floors and boards are off flat,"""
+_BUMP_M2 = 2.0 * np.pi * 0.1**2
+"""in bumps of this size: what one camera sees of a bump all errs alike."""
 _LEAST_PATCHES = 40
 _LEAST_SHARE = 0.3
 _FOREGROUND = 0.015
@@ -105,7 +107,8 @@ def _observe(
         return None
     cosine = np.abs(ray @ plane) / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(plane))
     on_plane = usable & (np.abs(inverse - ray @ plane) < gate) & (cosine > _INCIDENCE_COSINE)
-    patches = _patches(inverse, on_plane, cosine, count)
+    focal2 = camera.K[0, 0] * camera.K[1, 1]
+    patches = _patches(inverse, on_plane, cosine, count, focal2)
     if len(patches) < _LEAST_PATCHES:
         return None
     return PlaneObservation(camera.name, surface, int(on_plane.sum()), patches)
@@ -143,7 +146,9 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
     return best
 
 
-def _patches(inverse: Array, on_plane: Mask, cosine: Array, count: Image) -> Array:
+def _patches(
+    inverse: Array, on_plane: Mask, cosine: Array, count: Image, focal2_px2: float
+) -> Array:
     """Cell means (k, 4); every pixel is the mean of a count of frames."""
     height, width = (side // _CELL_PX for side in inverse.shape)
     v, u = np.nonzero(on_plane[: height * _CELL_PX, : width * _CELL_PX])
@@ -155,7 +160,9 @@ def _patches(inverse: Array, on_plane: Mask, cosine: Array, count: Image) -> Arr
         return np.asarray(np.bincount(cell, values, minlength=len(size))[kept] / size[kept])
 
     w = mean(inverse[v, u])
+    slant = mean(cosine[v, u])
     noise = mean((SQUARE_ERROR / cosine[v, u] + ROUNDING) / count[v, u]) / size[kept]
     # What stands out of a surface by h changes the depth along a ray by h / cosine.
-    variance = noise + (_UNEVEN_M * w**2 / mean(cosine[v, u])) ** 2
+    alike = np.maximum(_BUMP_M2 * focal2_px2 * w**2 * slant / size[kept], 1.0)
+    variance = noise + alike * (_UNEVEN_M * w**2 / slant) ** 2
     return np.stack([mean(u.astype(float)), mean(v.astype(float)), w, variance], axis=1)

@@ -22,6 +22,7 @@ from station.drivers.virtual_scene import (
     default_rig,
     load_mesh,
     moved,
+    uneven,
 )
 from station.errors import DriverError, InputError
 from station.recording import RecordedFrame
@@ -34,6 +35,8 @@ _SWAY_PERIOD_S = 3.1
 _LEAN_STEP_M = 0.00025
 """A view is rendered anew when the person leans by so much more: far below the sensor's noise."""
 _LIVE_LOOP_FRAMES = 24
+_FACTORY_SIGMA = (3e-4, 1.5e-3)
+"""Gain and curvature of inverse depth among units that have depth errors at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,17 @@ class SimulatedBooth:
     clutter: Sequence[Mesh] = ()
     """Further objects: a chair, a second person."""
     walls: bool = True
+    uneven_m: float = 0.0
+    """How far its floor, and a board that is held up in it, are off flat."""
+
+    @property
+    def fixtures(self) -> list[Mesh]:
+        """What stands in it beside the person."""
+        if not self.walls:
+            return [*self.clutter]
+        floor, *walls = booth_walls()
+        rng = np.random.default_rng((self.seed, 6))
+        return [uneven(floor, 2, self.uneven_m, rng), *walls, *self.clutter]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +94,14 @@ class SimulatedUnit:
     @classmethod
     def of(cls, booth: SimulatedBooth, name: str) -> SimulatedUnit:
         """A camera's unit; the same in every simulation of this booth."""
-        rng = np.random.default_rng((booth.seed, list(booth.rig.cameras).index(name), 1))
+        index = list(booth.rig.cameras).index(name)
+        rng = np.random.default_rng((booth.seed, index, 1))
+        made = np.random.default_rng((booth.seed, index, 5)).normal(0.0, _FACTORY_SIGMA)
         return cls(
             error=UnitError(
-                booth.bias_m * rng.uniform(-1.0, 1.0), tuple(rng.uniform(-0.3, 0.3, 2))
+                booth.bias_m * rng.uniform(-1.0, 1.0),
+                tuple(rng.uniform(-0.3, 0.3, 2)),
+                *(made if booth.bias_m else (0.0, 0.0)),
             ),
             drift=rng.uniform(-80e-6, 80e-6),
             phase_s=rng.uniform(0.0, 1.0 / FRAME_RATE_HZ),
@@ -129,7 +147,7 @@ class VirtualCamera:
             pose = camera.world_from_camera
             if camera.name in booth.moved_cameras:
                 pose = moved(pose, *booth.moved_cameras[camera.name])
-            meshes = [*(booth_walls() if booth.walls else ()), *booth.clutter]
+            meshes = booth.fixtures
             if self._body is not None:
                 meshes.append(_leaning(self._body, lean_m))
             if not meshes:

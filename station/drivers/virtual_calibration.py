@@ -19,7 +19,7 @@ from station.drivers.virtual import (
 )
 from station.drivers.virtual_noise import NoiselessView, TrueView, observe
 from station.drivers.virtual_round import Capsule, ball, overlay
-from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, box
+from station.drivers.virtual_scene import VirtualScene, box, uneven
 from station.errors import InputError
 
 Array = NDArray[np.float64]
@@ -114,11 +114,13 @@ class VirtualProcedure:
     def _still(self, camera: str, board_y_m: float | None) -> TrueView:
         """What does not move; most steps share it."""
         if (camera, board_y_m) not in self._views:
-            meshes: list[Mesh] = [*(booth_walls() if self.booth.walls else ()), *self.booth.clutter]
+            meshes = self.booth.fixtures
             if board_y_m is not None:
                 half, high = 0.5 * _BOARD_M[0], _BOARD_M[1]
                 near, far = board_y_m - 0.5 * _BOARD_THICK_M, board_y_m + 0.5 * _BOARD_THICK_M
-                meshes.append(box((-half, near, 0.0), (half, far, high)))
+                board = box((-half, near, 0.0), (half, far, high))
+                rng = np.random.default_rng((self.booth.seed, 8))
+                meshes.append(uneven(board, 1, self.booth.uneven_m, rng))
             calibration = self.booth.rig.cameras[camera]
             view = VirtualScene(meshes).view(calibration, calibration.world_from_camera)
             self._views[camera, board_y_m] = view

@@ -22,6 +22,8 @@ _WINDOW_PX = 9
 _FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
 _STEEP_RAD = np.radians(60.0)
 _RANGE_M = (0.5, 4.5)
+_MIDDLE_M = 1.0 / 0.6
+"""From here a unit's curvature counts."""
 
 Image = NDArray[np.float32]
 
@@ -64,10 +66,14 @@ class UnitError:
     """Its size at 2 m, growing with z^2."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """How much it changes over the image, relative, per half width and half height."""
+    gain: float = 0.0
+    """Relative error of all inverse depths: a baseline or a focal length that is not quite so."""
+    curvature: float = 0.0
+    """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
 
     def apply(self, depth_m: Image, window: Window | None = None) -> Image:
         """The depths that the unit reports; of a part of the image where a window is given."""
-        if self.bias_m == 0.0:
+        if self == UnitError():
             return depth_m
         window = window or Window(0, 0, *depth_m.shape)
         height, width = depth_m.shape
@@ -78,7 +84,9 @@ class UnitError:
             + self.tilt[0] * x[None, window.left : window.left + width]
             + self.tilt[1] * y[window.top : window.top + height, None]
         )
-        return np.asarray(depth_m + self.bias_m * shape * np.square(depth_m / 2.0), np.float32)
+        off = 0.25 * self.bias_m * shape * np.square(depth_m) + self.gain * depth_m
+        off += self.curvature * np.square(1.0 - depth_m / _MIDDLE_M)
+        return np.where(depth_m > 0.0, depth_m + off, 0.0).astype(np.float32)
 
 
 def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:

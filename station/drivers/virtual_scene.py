@@ -23,6 +23,10 @@ WIDTH, HEIGHT = 640, 480
 FOCAL_PX = 585.0
 _WALL_DISTANCE_M = 2.1
 _SHADOW_TOLERANCE_M = 0.01
+_BUMP_M = 0.1
+_BUMP_WAVES = 100
+_BUMP_HALVINGS = 6
+"""Of a box's edges: a floor's triangles come to 66 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,26 @@ def box(low_m: Sequence[float], high_m: Sequence[float]) -> Mesh:
     size = np.subtract(high_m, low_m)
     shape = o3d.geometry.TriangleMesh.create_box(*size)
     return Mesh(np.asarray(shape.vertices) + low_m, np.asarray(shape.triangles, np.int32))
+
+
+def uneven(flat: Mesh, axis: int, sigma_m: float, rng: np.random.Generator) -> Mesh:
+    """A floor or a board that is off flat by a standard deviation along an axis, in soft bumps.
+
+    Heights are Gaussian, and so is their correlation, which falls to 0.6 over 0.1 m.
+    """
+    if sigma_m == 0.0:
+        return flat
+    shape = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(flat.vertices), o3d.utility.Vector3iVector(flat.faces)
+    ).subdivide_midpoint(_BUMP_HALVINGS)
+    vertices = np.asarray(shape.vertices).copy()
+    waves = rng.normal(0.0, 1.0 / _BUMP_M, (2, _BUMP_WAVES))
+    phases = rng.uniform(0.0, 2.0 * np.pi, _BUMP_WAVES)
+    across = np.delete(vertices, axis, axis=1)
+    vertices[:, axis] += (
+        sigma_m * np.sqrt(2.0 / _BUMP_WAVES) * np.cos(across @ waves + phases).sum(1)
+    )
+    return Mesh(vertices, np.asarray(shape.triangles, np.int32))
 
 
 def rod(start_m: Sequence[float], end_m: Sequence[float], radius_m: float) -> Mesh:

@@ -27,7 +27,7 @@ import synthetic_calibration as synthetic
 
 from station.bundle import read_bundle
 from station.calibration.detections import Observations
-from station.calibration.rig import DepthCorrection, Rig
+from station.calibration.rig import Rig
 from station.calibration.simulated import simulate
 from station.calibration.solve import solve
 from station.calibration.world import relatives, twist_between
@@ -116,9 +116,7 @@ def true_rig(booth: SimulatedBooth) -> Rig:
     """Poses and depth corrections as they are."""
     cameras = {}
     for name, camera in booth.rig.cameras.items():
-        error = SimulatedUnit.of(booth, name).error
-        shift = error.bias_m / 4.0
-        correction = DepthCorrection((shift, 1.0), (shift * error.tilt[0], shift * error.tilt[1]))
+        correction = synthetic.true_correction(SimulatedUnit.of(booth, name).error)
         cameras[name] = replace(camera, depth_correction=correction)
     return replace(booth.rig, cameras=cameras)
 

@@ -4,13 +4,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic_calibration as synthetic
 
 from station.config import CameraConfig
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
 from station.drivers.registry import make_driver
 from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
-from station.drivers.virtual_noise import axial_sigma_m, raw_from_depth
-from station.drivers.virtual_scene import default_rig, load_mesh, sphere
+from station.drivers.virtual_noise import UnitError, axial_sigma_m, raw_from_depth
+from station.drivers.virtual_scene import (
+    VirtualScene,
+    box,
+    default_rig,
+    load_mesh,
+    sphere,
+    uneven,
+)
 from station.errors import DriverError, FormatError, InputError
 from station.recording import check_recording, read_raw, write_recording
 
@@ -61,6 +69,33 @@ def test_the_random_error_grows_as_published() -> None:
     step = z**2 / (8 * 585 * 0.075)
     expected = np.hypot(0.0012 + 0.0019 * (z - 0.4) ** 2, step / np.sqrt(12))
     assert nearest.std(axis=0).mean() == pytest.approx(expected, rel=0.35)
+
+
+def test_a_units_depth_error_is_of_the_form_that_is_corrected() -> None:
+    error = UnitError(0.012, (0.2, -0.1), gain=1e-3, curvature=3e-3)
+    for true_m in (1.0, 1.7, 2.4):
+        image = np.full((48, 64), true_m, np.float32)
+        image[0, 0] = 0.0
+        measured = error.apply(image)
+        assert measured[0, 0] == 0.0
+        away = synthetic.true_correction(error).apply(measured) - image
+        assert np.abs(away[1:]).max() < 4e-4
+        assert np.abs(measured - image)[1:].max() > 3e-3
+
+
+def test_an_uneven_floor_has_soft_bumps() -> None:
+    flat = box((-2.0, -2.0, -0.05), (2.0, 2.0, 0.0))
+    floor = uneven(flat, 2, 5e-4, np.random.default_rng(0))
+    top = floor.vertices[floor.vertices[:, 2] > -0.02]
+    inside = top[np.abs(top[:, :2]).max(axis=1) < 1.99]
+    assert inside[:, 2].std() == pytest.approx(5e-4, rel=0.2)
+    scene = VirtualScene([floor])
+    camera = default_rig().cameras["front-lower"]
+    view, plane = (s.view(camera, camera.world_from_camera) for s in (scene, VirtualScene([flat])))
+    seen = (view.depth_m > 0) & (plane.depth_m > 0)
+    slope = np.diff(np.where(seen, view.depth_m - plane.depth_m, 0.0), axis=1)
+    assert 0.0 < np.abs(slope[seen[:, 1:] & seen[:, :-1]]).max() < 2e-3
+    assert uneven(flat, 2, 0.0, np.random.default_rng(0)) is flat
 
 
 def test_grazing_surfaces_are_noisier() -> None:
