@@ -32,14 +32,19 @@ from station.geometry import skew
 
 Array = NDArray[np.float64]
 
-_ITERATIONS = 12
-_SMALL_STEP = 2e-6
+_ITERATIONS = 30
+_SETTLED = 0.01
+"""Step in standard deviations."""
 CLOCK_TOLERANCE_S = 0.005
 """Standard deviation of one camera's clock against another's, before it is solved for."""
 CONTACT_M = 0.0005
 """How evenly a ball rests on a floor."""
+TREMOR_M = 2e-4
+"""By which a hand is off a path that bends every tenth of a second, along each axis."""
 _TAIL = 4.0
 """Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
+_NEAR = 0.2
+"""Of the ball's radius: depth errors that are not corrected yet shift its centre by as much."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
@@ -95,26 +100,30 @@ def solve_joint(problem: Problem, start: State) -> State:
     state = start
     for _ in range(_ITERATIONS):
         equations = _Equations(problem, layout, state)
-        step, path_step = equations.solve()
+        step, path_step, size = equations.solve()
         state = moved_state(problem, layout, state, step)
         state = replace(state, controls=state.controls + path_step)
-        if max(np.abs(step).max(), np.abs(path_step).max()) < _SMALL_STEP:
+        if size < _SETTLED:
             break
     equations = _Equations(problem, layout, state)
     scale = equations.scale()
+    # The detections tell how noisy they are, and nothing of priors and floors.
+    information = _Equations(problem, layout, state, scale).schur()
     return replace(
         state,
-        covariance=np.asarray(np.linalg.inv(equations.schur()) * scale**2),
+        covariance=np.asarray(np.linalg.inv(information)),
         deviations=equations.deviations,
         scale=scale,
+        last_step=size,
     )
 
 
 class _Equations:
-    """The normal equations at a state."""
+    """The normal equations at a state, with the ball's noise so many times what is expected."""
 
-    def __init__(self, problem: Problem, layout: Layout, state: State) -> None:
+    def __init__(self, problem: Problem, layout: Layout, state: State, scale: float = 1.0) -> None:
         self._size = layout.size
+        self._trust = scale**-2.0
         count = state.grid.count
         self._border = np.zeros((layout.size, layout.size))
         self._border_pull = np.zeros(layout.size)
@@ -136,13 +145,13 @@ class _Equations:
         for place in problem.resting:
             self._add_contact(place, problem.radius_m, layout, state)
 
-    def solve(self) -> tuple[Array, Array]:
-        """Steps of the border (m,) and of the path (count, 3)."""
+    def solve(self) -> tuple[Array, Array, float]:
+        """Steps of the border (m,) and the path (count, 3); the border's in standard deviations."""
         schur = self.schur()
         pull = self._border_pull - self._coupling @ self._band_solve(self._path_pull)
         step = np.asarray(-np.linalg.solve(schur, pull))
         path = -self._band_solve(self._path_pull + self._coupling.T @ step)
-        return step, path.reshape(-1, 3)
+        return step, path.reshape(-1, 3), float(np.sqrt(step @ schur @ step))
 
     def schur(self) -> Array:
         """The border's information, the path marginalised."""
@@ -194,15 +203,19 @@ class _Equations:
         pose = state.poses[name]
         first, value, rate = state.grid.basis(seen.times_s + state.clock_s[name])
         centers = (along(state.controls, first, value) - pose[:3, 3]) @ pose[:3, :3]
-        normal, pull = local_equations(seen, centers, state.corrections[name], problem.radius_m)
+        near = _near(centers, seen.centers, _NEAR * problem.radius_m)
+        normal, pull = local_equations(seen, near, state.corrections[name], problem.radius_m)
+        pull += np.einsum("nij,nj->ni", normal[..., :3], centers - near)
+        normal, pull = trembling(normal, pull)
         deviation = _deviation(normal, pull)
         self.deviations[name] = deviation
         robust = _robust_weight(deviation)
-        normal, pull = normal * robust[:, None, None], pull * robust[:, None]
         self._cost += float(np.sum(robust * np.minimum(deviation, _GATE)))
         self._seen += float(np.sum(robust))
         for k in range(4):
             np.add.at(self._path_share, first + k, 0.25 * robust)
+        weight = self._trust * robust
+        normal, pull = normal * weight[:, None, None], pull * weight[:, None]
 
         turn = pose[:3, :3].T
         speed = along(state.controls, first, rate) @ pose[:3, :3]
@@ -244,14 +257,14 @@ class _Equations:
         normal, pull = local_equations(
             seen, centers, state.corrections[seen.camera], problem.radius_m
         )
-        robust = _robust_weight(_deviation(normal, pull))
+        weight = self._trust * _robust_weight(_deviation(normal, pull))
         chain = np.zeros((8, PER_CAMERA + 3))
         chain[:3, :3], chain[:3, 3:6] = skew(center), -np.eye(3)
         chain[3:, FOOT:PER_CAMERA] = np.eye(depth_correction.PARAMETERS)
         chain[:3, PER_CAMERA:] = pose[:3, :3].T
         index = np.concatenate([layout.camera(seen.camera), layout.triple(place)])
         self._add_border(
-            index, chain, np.einsum("n,nij->ij", robust, normal), np.einsum("n,ni->i", robust, pull)
+            index, chain, np.einsum("n,nij->ij", weight, normal), np.einsum("n,ni->i", weight, pull)
         )
 
     def _add_surface(self, surface: Surface, layout: Layout, state: State) -> None:
@@ -286,6 +299,25 @@ class _Equations:
         chain, index = chain[:, kept], index[kept]
         self._border[np.ix_(index, index)] += chain.T @ normal @ chain
         self._border_pull[index] += chain.T @ pull
+
+
+def _near(centers: Array, detected: Array, reach_m: float) -> Array:
+    """Where to linearise (n, 3): towards the centres, but where the rays still meet the ball.
+
+    What is seen of a ball says nothing of how well a place decimetres away agrees with it.
+    """
+    away = centers - detected
+    share = reach_m / np.maximum(np.linalg.norm(away, axis=1), reach_m)
+    return np.asarray(detected + share[:, None] * away)
+
+
+def trembling(normal: Array, pull: Array) -> tuple[Array, Array]:
+    """The equations (n, 8, 8), (n, 8) of a centre that is off the path by a tremor of its own."""
+    free = np.linalg.solve(normal[:, :3, :3] + np.eye(3) / TREMOR_M**2, normal[:, :3])
+    return (
+        normal - np.swapaxes(normal[:, :3], 1, 2) @ free,
+        pull - np.einsum("nij,ni->nj", free, pull[:, :3]),
+    )
 
 
 def _deviation(normal: Array, pull: Array) -> Array:

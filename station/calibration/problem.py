@@ -130,6 +130,8 @@ class State:
     """Squared deviation (n,) of each waved detection's centre in units of its noise."""
     scale: float = 1.0
     """Observed over expected standard deviation."""
+    last_step: float = np.inf
+    """On the way here, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ _AGREEING_SHARE = 0.5
 _LARGEST_SIGMA_M = 0.002
 _LARGEST_SIGMA_RAD = np.radians(0.1)
 _LARGEST_SCATTER = 3.0
+_LARGEST_LAST_STEP = 0.3
 _MARK_TOLERANCE_M = 0.008
 _LARGEST_SLOPE_RAD = np.radians(0.1)
 """A body's head is 3 mm to one side at it."""
@@ -120,6 +121,14 @@ def check_scatter(state: State) -> None:
                 f"camera {name} scatters {scatter:.1f} times as much as a sound sensor does: let "
                 "it warm up for 20 minutes, keep the sun out of the booth, or replace it"
             )
+
+
+def check_settled(state: State) -> None:
+    if state.last_step > _LARGEST_LAST_STEP:
+        raise CalibrationError(
+            "what the cameras saw does not settle on one booth: take away what else is round, let "
+            "no camera move, and wave the ball again"
+        )
 
 
 def check_held_out(found: Mapping[str, HeldOut]) -> None:

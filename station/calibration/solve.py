@@ -156,6 +156,7 @@ def solve(
     state = solve_joint(
         problem, replace(start, corrections=tested.corrections, clock_s=tested.clock_s)
     )
+    refusals.check_settled(state)
     placed = world.place(problem, state, front_cameras)
     refusals.check_sigma(placed, reference, covered)
     refusals.check_slope(placed)

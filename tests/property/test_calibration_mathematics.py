@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from station.calibration.depth_correction import correction_of, design
-from station.calibration.joint import ball_inverse_depth
+from station.calibration.joint import TREMOR_M, ball_inverse_depth, trembling
 from station.calibration.pairwise import Track, relate
 from station.calibration.trajectory import KNOT_S, TimeGrid, along
 from station.calibration.world import Placed, relatives, twist_between
@@ -28,6 +28,21 @@ def test_a_balls_inverse_depth_and_its_derivative(seed: int) -> None:
         step = 1e-6 * np.eye(3)[axis]
         ends = [ball_inverse_depth(center + s * step, ray, 0.1)[0] for s in (1.0, -1.0)]
         assert np.allclose((ends[0] - ends[1]) / 2e-6, gradient[..., axis], rtol=1e-4, atol=1e-4)
+
+
+@given(SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_a_tremor_widens_a_centres_covariance_and_moves_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(0, 1e3, (2, 20, 8))
+    normal, pull = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, 8))
+    loose, loose_pull = trembling(normal, pull)
+    before, after = (np.linalg.inv(matrix[:, :3, :3]) for matrix in (normal, loose))
+    assert np.allclose(after, before + TREMOR_M**2 * np.eye(3), rtol=1e-6)
+    best, still = (
+        np.linalg.solve(a, b[..., None]) for a, b in ((normal, pull), (loose, loose_pull))
+    )
+    assert np.allclose(best, still, rtol=1e-6)
 
 
 @given(SEEDS)
