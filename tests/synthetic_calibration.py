@@ -19,7 +19,7 @@ from station.calibration.joint import ball_inverse_depth, local_equations
 from station.calibration.problem import Sightings
 from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
 from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
-from station.drivers.virtual import FRAME_RATE_HZ, SimulatedBooth, SimulatedUnit
+from station.drivers.virtual import SimulatedBooth, SimulatedUnit
 from station.drivers.virtual_calibration import AROUND, BALL, VirtualProcedure
 from station.drivers.virtual_noise import UnitError
 from station.drivers.virtual_scene import default_rig
@@ -43,7 +43,8 @@ def booth(seed: int, bias_m: float = 0.015) -> SimulatedBooth:
         for name, camera in rig.cameras.items()
     }
     rig = replace(rig, cameras=cameras)
-    return SimulatedBooth(rig=rig, seed=seed, bias_m=bias_m, uneven_m=5e-4)
+    uneven = {"uneven_floor_m": 5e-4, "uneven_board_m": 2e-4}
+    return SimulatedBooth(rig=rig, seed=seed, bias_m=bias_m, **uneven)
 
 
 def factory(rig: Rig) -> dict[str, CameraCalibration]:
@@ -74,8 +75,7 @@ def observations(
         rng = np.random.default_rng((procedure.booth.seed, index, 9))
         unit = SimulatedUnit.of(procedure.booth, name)
         late_s = clock_error_s * rng.standard_normal()
-        step_s = round(FRAME_RATE_HZ / rate_hz) / FRAME_RATE_HZ
-        for time_s in np.arange(start_s + unit.phase_s, start_s + procedure.waving_s, step_s):
+        for time_s in np.arange(start_s + unit.phase_s, start_s + procedure.waving_s, 1 / rate_hz):
             seen = _ball(camera, unit, procedure.ball_center_m(time_s), procedure, rng)
             if seen is not None:
                 waved.append(replace(seen, time_s=float(time_s + late_s)))

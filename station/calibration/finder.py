@@ -6,8 +6,6 @@ from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numpy as np
-
 from station.calibration.ball import find_ball
 from station.calibration.detections import BallDetection
 from station.calibration.feed import TimedFrame
@@ -17,8 +15,10 @@ from station.calibration.session import Session
 _THREADS = 2
 _WAITING = 6
 """More frames than that do not wait: newer ones come."""
-_APART_S = 0.75 / INDEPENDENT_HZ
-"""Frames come at a fixed rate: what is nearer than that is nearer than wanted."""
+_APART_S = 1.0 / INDEPENDENT_HZ
+_EARLY_S = 0.1 * _APART_S
+_RESET_S = 1.0
+"""A frame that is earlier than expected by more is of a clock that was reset."""
 
 
 class BallFinder:
@@ -33,7 +33,7 @@ class BallFinder:
             if (view := session.background(name)) is not None
         }
         self._patient = patient
-        self._last_s: dict[str, float] = {}
+        self._due_s: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(_THREADS)
         self._pending: deque[Future[BallDetection | None]] = deque()
 
@@ -46,10 +46,14 @@ class BallFinder:
     def look(self, frames: Iterable[TimedFrame]) -> None:
         """Take frames to look at: of each camera so many a second as are worth it."""
         for frame in frames:
-            # A clock that is reset may also go back.
-            apart_s = abs(frame.time_s - self._last_s.get(frame.camera, np.inf))
-            if apart_s > _APART_S and (self._patient or len(self._pending) < _WAITING):
-                self._last_s[frame.camera] = frame.time_s
+            due_s = self._due_s.get(frame.camera, frame.time_s)
+            late_s = frame.time_s - due_s
+            if -_RESET_S < late_s < -_EARLY_S:
+                continue
+            if self._patient or len(self._pending) < _WAITING:
+                # What is near the beat keeps it: of 30 frames a second 20 are looked at, not 15.
+                beat_s = due_s if abs(late_s) < 1.5 * _APART_S else frame.time_s
+                self._due_s[frame.camera] = beat_s + _APART_S
                 self._pending.append(self._pool.submit(self._find, frame))
 
     def found(self, *, wait: bool = False) -> list[BallDetection]:

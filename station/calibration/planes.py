@@ -27,10 +27,11 @@ _TILT_COSINE = 0.6
 _HEIGHT_M = (0.15, 3.5)
 _INCIDENCE_COSINE = 0.26
 """75 degrees: a camera at hip height sees the floor at a slant, if at all."""
-_UNEVEN_M = 5e-4
-"""How far floors and boards are off flat,"""
+_UNEVEN_FLOOR_M, _UNEVEN_BOARD_M = 5e-4, 2e-4
+"""How far what is built and what is made are off flat, rms (DIN 18202 lets a finished floor be off
+by 2 mm over 0.1 m), ..."""
 _BUMP_M2 = 2.0 * np.pi * 0.1**2
-"""in bumps of this size: what one camera sees of a bump all errs alike."""
+"""... in bumps of this size: what one camera sees of a bump errs all alike."""
 _LEAST_PATCHES = 40
 _LEAST_SHARE = 0.3
 _FOREGROUND = 0.015
@@ -107,8 +108,7 @@ def _observe(
         return None
     cosine = np.abs(ray @ plane) / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(plane))
     on_plane = usable & (np.abs(inverse - ray @ plane) < gate) & (cosine > _INCIDENCE_COSINE)
-    focal2 = camera.K[0, 0] * camera.K[1, 1]
-    patches = _patches(inverse, on_plane, cosine, count, focal2)
+    patches = _patches(inverse, on_plane, cosine, count, camera, surface)
     if len(patches) < _LEAST_PATCHES:
         return None
     return PlaneObservation(camera.name, surface, int(on_plane.sum()), patches)
@@ -147,7 +147,12 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
 
 
 def _patches(
-    inverse: Array, on_plane: Mask, cosine: Array, count: Image, focal2_px2: float
+    inverse: Array,
+    on_plane: Mask,
+    cosine: Array,
+    count: Image,
+    camera: CameraCalibration,
+    surface: str,
 ) -> Array:
     """Cell means (k, 4); every pixel is the mean of a count of frames."""
     height, width = (side // _CELL_PX for side in inverse.shape)
@@ -162,7 +167,9 @@ def _patches(
     w = mean(inverse[v, u])
     slant = mean(cosine[v, u])
     noise = mean((SQUARE_ERROR / cosine[v, u] + ROUNDING) / count[v, u]) / size[kept]
+    cells_m2 = size[kept] / (camera.K[0, 0] * camera.K[1, 1] * w**2 * slant)
+    alike = np.maximum(_BUMP_M2 / cells_m2, 1.0)
     # What stands out of a surface by h changes the depth along a ray by h / cosine.
-    alike = np.maximum(_BUMP_M2 * focal2_px2 * w**2 * slant / size[kept], 1.0)
-    variance = noise + alike * (_UNEVEN_M * w**2 / slant) ** 2
+    uneven_m = _UNEVEN_FLOOR_M if surface == FLOOR else _UNEVEN_BOARD_M
+    variance = noise + alike * (uneven_m * w**2 / slant) ** 2
     return np.stack([mean(u.astype(float)), mean(v.astype(float)), w, variance], axis=1)

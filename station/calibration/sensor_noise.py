@@ -17,6 +17,7 @@ SQUARE_ERROR = CORRELATED_PX * RANDOM_SIGMA**2
 """Variance of the mean of n pixels is (SQUARE_ERROR / cosine + ROUNDING) / n."""
 ROUNDING = STEP**2 / 12.0
 """Rounding errors of neighbouring pixels are independent: the random error spans half a step."""
-INDEPENDENT_HZ = 15.0
-"""Frames a second of what is waved at 0.4 m/s whose errors are independent: at 1.7 m it moves by a
-matching window of 9 px meanwhile. More of them would seem to say more than they do."""
+INDEPENDENT_HZ = 20.0
+"""Frames a second of what is waved at 0.4 m/s whose errors are independent: at 1.7 m it moves by
+7 px meanwhile, over which the correlation of errors falls to a hundredth. More of them would seem
+to say more than they do."""

@@ -40,7 +40,7 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
     rng = np.random.default_rng((procedure.booth.seed, index, 4))
     clock = DeviceClock(TICK_HZ, 32)
 
-    def timed(step: str, limit_s: float | None, every: int) -> Iterator[tuple[float, _Depth]]:
+    def timed(step: str, limit_s: float | None, every: float) -> Iterator[tuple[float, _Depth]]:
         for frame in procedure.frames(name, step, stride=every, limit_s=limit_s):
             delay_s = _TRANSPORT_S[0] + rng.exponential(_TRANSPORT_S[1])
             time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)

@@ -59,7 +59,8 @@ class SimulatedBooth:
     clutter: Sequence[Mesh] = ()
     """Further objects: a chair, a second person."""
     walls: bool = True
-    uneven_m: float = 0.0
+    uneven_floor_m: float = 0.0
+    uneven_board_m: float = 0.0
     """How far its floor, and a board that is held up in it, are off flat."""
 
     @property
@@ -69,7 +70,7 @@ class SimulatedBooth:
             return [*self.clutter]
         floor, *walls = booth_walls()
         rng = np.random.default_rng((self.seed, 6))
-        return [uneven(floor, 2, self.uneven_m, rng), *walls, *self.clutter]
+        return [uneven(floor, 2, self.uneven_floor_m, rng), *walls, *self.clutter]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from station.errors import InputError
 Array = NDArray[np.float64]
 
 EMPTY, BALL, MARK, FRONT, AROUND = "empty", "ball", "mark", "front", "around"
-STRIDE = round(FRAME_RATE_HZ / INDEPENDENT_HZ)
+STRIDE = FRAME_RATE_HZ / INDEPENDENT_HZ
 """No more frames of a ball are looked at."""
 _REST_S = 2.0
 _PAUSE_S = 3.0
@@ -69,9 +69,9 @@ class VirtualProcedure:
         raise InputError(f"the calibration has no step {step} (it has: {', '.join(self.steps)})")
 
     def frames(
-        self, camera: str, step: str, *, stride: int = 1, limit_s: float | None = None
+        self, camera: str, step: str, *, stride: float = 1.0, limit_s: float | None = None
     ) -> Iterator[VirtualFrame]:
-        """A camera's frames of a step: every stride-th of 30 a second."""
+        """A camera's frames of a step: every stride-th of 30 a second, on the average."""
         unit = SimulatedUnit.of(self.booth, camera)
         calibration = self.booth.rig.cameras[camera]
         index = list(self.booth.rig.cameras).index(camera)
@@ -84,7 +84,8 @@ class VirtualProcedure:
         start_s = self.starts_s(step)
         first = int(np.ceil((start_s - unit.phase_s) * FRAME_RATE_HZ))
         lasts_s = min(self._lasts_s(step), limit_s or np.inf)
-        for sequence in range(first, first + int(lasts_s * FRAME_RATE_HZ), stride):
+        count = int(lasts_s * FRAME_RATE_HZ)
+        for sequence in (first + int(later) for later in np.arange(0.0, count, stride)):
             time_s = unit.phase_s + sequence / FRAME_RATE_HZ
             raw = loop[int(rng.integers(len(loop)))] if moves else still.read(rng)
             drawn = overlay(view, calibration, self._moving(step, time_s))
@@ -120,7 +121,7 @@ class VirtualProcedure:
                 near, far = board_y_m - 0.5 * _BOARD_THICK_M, board_y_m + 0.5 * _BOARD_THICK_M
                 board = box((-half, near, 0.0), (half, far, high))
                 rng = np.random.default_rng((self.booth.seed, 8))
-                meshes.append(uneven(board, 1, self.booth.uneven_m, rng))
+                meshes.append(uneven(board, 1, self.booth.uneven_board_m, rng))
             calibration = self.booth.rig.cameras[camera]
             view = VirtualScene(meshes).view(calibration, calibration.world_from_camera)
             self._views[camera, board_y_m] = view

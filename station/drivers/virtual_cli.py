@@ -111,12 +111,12 @@ def _record_person(
 
 def _record_step(procedure: VirtualProcedure, name: str, step: str, folder: Path) -> int:
     # In the empty booth the floor is hardly seen: each frame counts.
-    stride = 1 if step == EMPTY else STRIDE
+    stride = 1.0 if step == EMPTY else STRIDE
     return write_recording(folder, _frames_of(procedure, name, step, stride), tick_hz=TICK_HZ)
 
 
 def _frames_of(
-    procedure: VirtualProcedure, name: str, step: str, stride: int
+    procedure: VirtualProcedure, name: str, step: str, stride: float
 ) -> Iterator[RecordedFrame]:
     for frame in procedure.frames(name, step, stride=stride):
         yield RecordedFrame(frame.time_s, frame.ticks, frame.raw)
