@@ -57,8 +57,9 @@ def large_jump(
     votes: dict[str, list[float]] = {}
     for (a, b), pair in pairs.items():
         shifts = _window_shifts(tracks[a], tracks[b], pair)
-        for shift in shifts:
-            if sum(abs(shift - other) < _ONE_JUMP_S for other in shifts) >= 2:
+        for shift, _ in shifts:
+            alike = [apart for other, apart in shifts if abs(shift - other) < _ONE_JUMP_S]
+            if len(alike) >= 2 and any(alike):
                 votes.setdefault(a, []).append(-shift)
                 votes.setdefault(b, []).append(shift)
                 break
@@ -131,8 +132,9 @@ def _seen_s(times_s: Array) -> float:
     return _COUNTED_S * len(np.unique(np.floor(times_s / _COUNTED_S)))
 
 
-def _window_shifts(a: Track, b: Track, pair: Pair) -> list[float]:
-    """By how much b's clock is late in each window in which the pair does not agree otherwise."""
+def _window_shifts(a: Track, b: Track, pair: Pair) -> list[tuple[float, bool]]:
+    """By how much b's clock is late in each window in which the pair does not agree otherwise, and
+    whether it disagrees: where they hardly see the ball together, slow balls fit many shifts."""
     later = np.arange(_SHORTEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
     shifts = np.concatenate([-later[::-1], later])
     found = []
@@ -146,7 +148,7 @@ def _window_shifts(a: Track, b: Track, pair: Pair) -> list[float]:
         shares = [_agreement(a, b, pair.a_from_b, window, float(shift)) for shift in shifts]
         best = int(np.argmax(shares))
         if shares[best] > before + _GAIN:
-            found.append(float(shifts[best]))
+            found.append((float(shifts[best]), known))
     return found
 
 
