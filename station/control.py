@@ -181,10 +181,7 @@ class ControlProcess:
             sensed: dict[str, Any] = sync.content
         except BoothError as error:
             sensed = {"error": str(error)}
-        counts: dict[str, int] = {}
-        for state, _ in self._spool.every():
-            counts[state] = counts.get(state, 0) + 1
-        return {"streaming": self._streaming, "spool": counts, "sync": sensed}
+        return {"streaming": self._streaming, "spool": self._spool.counts(), "sync": sensed}
 
 
 @click.command()

@@ -6,7 +6,7 @@ import json
 import secrets
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from station.config import BoothConfig, find_config, load_config
 from station.errors import BoothError
 from station.messages import Request
 from station.session import FINAL
+from station.spool import Spool
 from station.transport import ask
 
 _POLL_S = 0.05
@@ -101,7 +102,13 @@ def status(config_path: Path | None, as_json: bool) -> None:
       station status --json
     """
     config = load_config(find_config(config_path))
-    content = _command(config, Request("status"))
+    try:
+        content = _command(config, Request("status"))
+    except BoothError:
+        # What was accepted and delivered is on disk, whether a station runs or not.
+        if config.spool.folder.is_dir() and not as_json:
+            _show_spool(Spool(config.spool.folder).counts())
+        raise
     if as_json:
         click.echo(json.dumps(content))
         return
@@ -116,8 +123,13 @@ def status(config_path: Path | None, as_json: bool) -> None:
         )
     if "error" in content["sync"]:
         click.echo(f"  {content['sync']['error']}")
-    spool = ", ".join(f"{count} {state}" for state, count in content["spool"].items())
-    click.echo(f"spool: {spool or 'empty'}")
+    _show_spool(content["spool"])
+
+
+def _show_spool(counts: Mapping[str, int]) -> None:
+    click.echo(
+        f"spool: {', '.join(f'{count} {state}' for state, count in counts.items()) or 'empty'}"
+    )
 
 
 @click.command()

@@ -18,6 +18,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,6 +134,10 @@ class Spool:
         for state in STATES:
             for entry in sorted((self.folder / state).iterdir()):
                 yield state, entry
+
+    def counts(self) -> dict[str, int]:
+        """State -> how many scans are in it."""
+        return dict(Counter(state for state, _ in self.every()))
 
     def _lock(self, scan_id: str) -> int | None:
         """The scan's lock, or None while a living process holds it."""

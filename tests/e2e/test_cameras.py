@@ -16,6 +16,7 @@ from station.config import CameraConfig
 from station.drivers.freenect import LIBRARY_VARIABLE, FreenectDriver, find_library
 from station.drivers.registry import make_driver
 from station.errors import DriverError
+from station.spool import Spool
 
 STATION = (sys.executable, "-m", "station.cli")
 
@@ -101,12 +102,14 @@ def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch, bo
 def test_commands_without_a_station_end_with_the_remedy(booth: Path, tmp_path: Path) -> None:
     config = tmp_path / "booth.toml"
     config.write_text((booth / "booth.toml").read_text() + "[runtime]\ncommand_timeout_s = 0.5\n")
+    (Spool(tmp_path / "spool").folder / "outbox/20260101T000000Z-0000").mkdir()
     done = subprocess.run(
         [*STATION, "status", "--config", str(config)],
         capture_output=True, text=True, timeout=20, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert "station run" in done.stderr
+    assert done.stdout == "spool: 1 outbox\n"
 
 
 def test_one_station_to_a_runtime_folder(make_station: Callable[..., object]) -> None:
