@@ -28,6 +28,7 @@ _LARGEST_SIGMA_M = 0.002
 _LARGEST_SIGMA_RAD = np.radians(0.1)
 _LARGEST_SCATTER = 3.0
 _LARGEST_LAST_STEP = 0.3
+"""Standard deviations."""
 _MARK_TOLERANCE_M = 0.008
 _LARGEST_SLOPE_RAD = np.radians(0.1)
 """A body's head is 3 mm to one side at it."""
@@ -124,7 +125,7 @@ def check_scatter(state: State) -> None:
 
 
 def check_settled(state: State) -> None:
-    if state.last_step > _LARGEST_LAST_STEP:
+    if not state.last_step < _LARGEST_LAST_STEP:
         raise CalibrationError(
             "what the cameras saw does not settle on one booth: take away what else is round, let "
             "no camera move, and wave the ball again"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import synthetic_calibration as synthetic
 
+from station.calibration import joint
 from station.calibration.detections import BallDetection, Observations
 from station.calibration.rig import Rig
 from station.calibration.sensor_noise import INDEPENDENT_HZ
@@ -195,6 +196,14 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure
     solution = solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
     twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
+
+
+def test_what_does_not_settle_is_refused(
+    procedure: VirtualProcedure, seen: Observations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(joint, "_ITERATIONS", 1)
+    with pytest.raises(CalibrationError, match="does not settle on one booth"):
+        solved(procedure.booth.rig, seen)
 
 
 def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
