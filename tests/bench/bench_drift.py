@@ -27,7 +27,7 @@ from station.calibration.scene import StaticView, static_view
 from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
 from station.drivers.virtual import SimulatedBooth, SimulatedUnit
 from station.drivers.virtual_noise import NoiselessView, TrueView
-from station.drivers.virtual_scene import Mesh, VirtualScene, booth_walls, fixed_posts, load_mesh
+from station.drivers.virtual_scene import Mesh, VirtualScene, fixed_posts, load_mesh
 from station.geometry import se3_exp
 
 BODIES = Path(__file__).parents[2] / "station/data/bodies"
@@ -57,7 +57,7 @@ class _Sensor:
     def __init__(self, booth: SimulatedBooth, name: str) -> None:
         self.camera: CameraCalibration = booth.rig.cameras[name]
         self._unit = SimulatedUnit.of(booth, name)
-        self._around = [*booth_walls(), *booth.clutter]
+        self._around = booth.fixtures
         self._rng = np.random.default_rng((7, list(booth.rig.cameras).index(name)))
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "view.npz"
