@@ -21,7 +21,7 @@ from station.messages import DesiredState, Reply, Request, ScanEvent
 from station.retention import expire_old
 from station.service import notify, set_up_logs, stop_event
 from station.session import ON_DISK, Session, advance, expire
-from station.spool import REASON, Spool
+from station.spool import REASON, Spool, count_scans
 from station.topics import TOPICS
 from station.transport import ask, publisher, server, subscriber
 
@@ -181,7 +181,11 @@ class ControlProcess:
             sensed: dict[str, Any] = sync.content
         except BoothError as error:
             sensed = {"error": str(error)}
-        return {"streaming": self._streaming, "spool": self._spool.counts(), "sync": sensed}
+        return {
+            "streaming": self._streaming,
+            "spool": count_scans(self._spool.folder),
+            "sync": sensed,
+        }
 
 
 @click.command()

@@ -7,6 +7,7 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from station.config import BoothConfig, find_config, load_config
 from station.errors import BoothError
 from station.messages import Request
 from station.session import FINAL
-from station.spool import Spool
+from station.spool import count_scans
 from station.transport import ask
 
 _POLL_S = 0.05
@@ -107,7 +108,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
     except BoothError:
         # What was accepted and delivered is on disk, whether a station runs or not.
         if config.spool.folder.is_dir() and not as_json:
-            _show_spool(Spool(config.spool.folder).counts())
+            with suppress(OSError):
+                _show_spool(count_scans(config.spool.folder))
         raise
     if as_json:
         click.echo(json.dumps(content))

@@ -18,7 +18,6 @@ import json
 import os
 import shutil
 import time
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,17 @@ REASON = "reason.json"
 _BUNDLE_BYTES = 40 << 20
 """More than forty depth frames take."""
 _LEFTOVER_AGE_S = 600.0
+
+
+def count_scans(folder: Path) -> dict[str, int]:
+    """State -> how many scans of a spool are in it; touches nothing.
+
+    Raises:
+        OSError: the spool is another user's.
+    """
+    found = {state: folder / state for state in STATES if (folder / state).is_dir()}
+    counts = {state: len(list(place.iterdir())) for state, place in found.items()}
+    return {state: count for state, count in counts.items() if count}
 
 
 class Spool:
@@ -134,10 +144,6 @@ class Spool:
         for state in STATES:
             for entry in sorted((self.folder / state).iterdir()):
                 yield state, entry
-
-    def counts(self) -> dict[str, int]:
-        """State -> how many scans are in it."""
-        return dict(Counter(state for state, _ in self.every()))
 
     def _lock(self, scan_id: str) -> int | None:
         """The scan's lock, or None while a living process holds it."""

@@ -20,8 +20,8 @@ from station.errors import CalibrationError
 _FRAMES = 30
 _SENSORS_S = 20.0
 _EXIT_MOVED = 3
-_EMPTY_SHARE = 0.97
-"""An empty booth shows all of the stored background, a person hides a third of it."""
+_SAME_SHARE = 0.97
+"""An unchanged booth shows all of the stored background, a person hides a third of it."""
 
 
 @click.command()
@@ -72,12 +72,14 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool) -> N
                     f"  this booth shows it no small move {', '.join(move.unseen_words())}: "
                     "a fixed post or corner in its view would"
                 )
-    hidden = [move for move in moves if not move.lost and move.share < _EMPTY_SHARE]
-    if hidden and not as_json:
-        most = min(hidden, key=lambda move: move.share)
+    changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
+    if changed and not as_json:
+        most = min(changed, key=lambda move: move.share)
+        percent = 100.0 * (1.0 - most.share)
         click.echo(
-            f"something stands in the booth ({100 * (1.0 - most.share):.0f} % of what camera "
-            f"{most.camera} saw is hidden): leave it empty, and small moves are noticed better"
+            f"the booth does not look as it did when it was calibrated ({percent:.0f} % of what "
+            f"camera {most.camera} sees differs): take out whoever and whatever was not "
+            "there, put back what is missing, and small moves are noticed better"
         )
     if any(move.moved or move.lost for move in moves):
         sys.exit(_EXIT_MOVED)

@@ -58,7 +58,7 @@ def large_jump(
     for (a, b), pair in pairs.items():
         shifts = _window_shifts(tracks[a], tracks[b], pair)
         for shift, _ in shifts:
-            alike = [apart for other, apart in shifts if abs(shift - other) < _ONE_JUMP_S]
+            alike = [known for other, known in shifts if abs(shift - other) < _ONE_JUMP_S]
             if len(alike) >= 2 and any(alike):
                 votes.setdefault(a, []).append(-shift)
                 votes.setdefault(b, []).append(shift)
@@ -134,7 +134,7 @@ def _seen_s(times_s: Array) -> float:
 
 def _window_shifts(a: Track, b: Track, pair: Pair) -> list[tuple[float, bool]]:
     """By how much b's clock is late in each window in which the pair does not agree otherwise, and
-    whether it disagrees: where they hardly see the ball together, slow balls fit many shifts."""
+    whether they see the ball together there: where they hardly do, slow balls fit many shifts."""
     later = np.arange(_SHORTEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
     shifts = np.concatenate([-later[::-1], later])
     found = []

@@ -16,7 +16,7 @@ _THREADS = 2
 _WAITING = 6
 """More frames than that do not wait: newer ones come."""
 _APART_S = 1.0 / INDEPENDENT_HZ
-_EARLY_S = 0.1 * _APART_S
+_EARLY_S, _NEAR_S = 0.1 * _APART_S, 1.5 * _APART_S
 _RESET_S = 1.0
 """A frame that is earlier than expected by more is of a clock that was reset."""
 
@@ -52,7 +52,7 @@ class BallFinder:
                 continue
             if self._patient or len(self._pending) < _WAITING:
                 # What is near the beat keeps it: of 30 frames a second 20 are looked at, not 15.
-                beat_s = due_s if abs(late_s) < 1.5 * _APART_S else frame.time_s
+                beat_s = due_s if abs(late_s) < _NEAR_S else frame.time_s
                 self._due_s[frame.camera] = beat_s + _APART_S
                 self._pending.append(self._pool.submit(self._find, frame))
 

@@ -43,8 +43,8 @@ TREMOR_M = 2e-4
 """By which a hand is off a path that bends every tenth of a second, along each axis."""
 _TAIL = 4.0
 """Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
-_NEAR = 0.2
-"""Of the ball's radius: depth errors that are not corrected yet shift its centre by as much."""
+_NEAR_M = 0.05
+"""Depth errors that are not corrected yet shift a ball along its ray, by less than that."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
@@ -95,7 +95,18 @@ def local_equations(
 
 
 def solve_joint(problem: Problem, start: State) -> State:
-    """The most likely state, its covariance, and each detection's deviation."""
+    """The most likely state, its covariance, and each detection's deviation.
+
+    Where none is found, because what was seen contradicts itself, the last step is infinite.
+    """
+    try:
+        with np.errstate(over="raise", invalid="raise"):
+            return _settle(problem, start)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return replace(start, last_step=np.inf)
+
+
+def _settle(problem: Problem, start: State) -> State:
     layout = Layout.of(problem)
     state = start
     for _ in range(_ITERATIONS):
@@ -203,7 +214,7 @@ class _Equations:
         pose = state.poses[name]
         first, value, rate = state.grid.basis(seen.times_s + state.clock_s[name])
         centers = (along(state.controls, first, value) - pose[:3, 3]) @ pose[:3, :3]
-        near = _near(centers, seen.centers, _NEAR * problem.radius_m)
+        near = _near(centers, seen.centers)
         normal, pull = local_equations(seen, near, state.corrections[name], problem.radius_m)
         pull += np.einsum("nij,nj->ni", normal[..., :3], centers - near)
         normal, pull = trembling(normal, pull)
@@ -301,14 +312,14 @@ class _Equations:
         self._border_pull[index] += chain.T @ pull
 
 
-def _near(centers: Array, detected: Array, reach_m: float) -> Array:
-    """Where to linearise (n, 3): towards the centres, but where the rays still meet the ball.
+def _near(centers: Array, detected: Array) -> Array:
+    """Where to linearise (n, 3): as far as the centres, but where the rays meet the ball.
 
     What is seen of a ball says nothing of how well a place decimetres away agrees with it.
     """
-    away = centers - detected
-    share = reach_m / np.maximum(np.linalg.norm(away, axis=1), reach_m)
-    return np.asarray(detected + share[:, None] * away)
+    ray = detected / np.linalg.norm(detected, axis=1, keepdims=True)
+    farther_m = np.einsum("ni,ni->n", centers - detected, ray)
+    return np.asarray(detected + np.clip(farther_m, -_NEAR_M, _NEAR_M)[:, None] * ray)
 
 
 def trembling(normal: Array, pull: Array) -> tuple[Array, Array]:

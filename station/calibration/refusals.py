@@ -27,8 +27,8 @@ _AGREEING_SHARE = 0.5
 _LARGEST_SIGMA_M = 0.002
 _LARGEST_SIGMA_RAD = np.radians(0.1)
 _LARGEST_SCATTER = 3.0
-_LARGEST_LAST_STEP = 0.3
-"""Standard deviations."""
+SETTLED, LOST = 0.3, 10.0
+"""Last steps, in standard deviations: beyond the second nobody can tell whose fault it is."""
 _MARK_TOLERANCE_M = 0.008
 _LARGEST_SLOPE_RAD = np.radians(0.1)
 """A body's head is 3 mm to one side at it."""
@@ -124,11 +124,11 @@ def check_scatter(state: State) -> None:
             )
 
 
-def check_settled(state: State) -> None:
-    if not state.last_step < _LARGEST_LAST_STEP:
+def check_settled(state: State, largest_step: float = SETTLED) -> None:
+    if not state.last_step < largest_step:
         raise CalibrationError(
-            "what the cameras saw does not settle on one booth: take away what else is round, let "
-            "no camera move, and wave the ball again"
+            "the cameras contradict one another: a head or something else that is round may have "
+            "been taken for the ball; take it away, let no camera move, and wave the ball again"
         )
 
 

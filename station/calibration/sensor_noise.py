@@ -18,6 +18,6 @@ SQUARE_ERROR = CORRELATED_PX * RANDOM_SIGMA**2
 ROUNDING = STEP**2 / 12.0
 """Rounding errors of neighbouring pixels are independent: the random error spans half a step."""
 INDEPENDENT_HZ = 20.0
-"""Frames a second of what is waved at 0.4 m/s whose errors are independent: at 1.7 m it moves by
-7 px meanwhile, over which the correlation of errors falls to a hundredth. More of them would seem
-to say more than they do."""
+"""Frames a second of what is waved at 0.4 m/s whose errors are nearly independent: at 1.7 m it
+moves by 7 px in a twentieth of a second, over which the correlation of errors falls to a hundredth;
+neighbours among 30 a second share an eighth. More of them would seem to say more than they do."""

@@ -139,6 +139,7 @@ def solve(
     progress("solving without every fifth second")
     training = acceptance.without_held_out(problem)
     tested = solve_joint(training, first_state(training, poses))
+    refusals.check_settled(tested, refusals.LOST)
     found = acceptance.compare(problem, tested)
     refusals.check_clocks(
         clocks.small_jump(

@@ -81,7 +81,7 @@ def test_a_scan_is_refused_when_a_camera_has_moved(
     assert checked.returncode == 3
     assert "camera front-upper has moved" in checked.stdout
     assert "camera back-upper stands where it was calibrated" in checked.stdout
-    assert "something stands in the booth" in checked.stdout
+    assert "does not look as it did" in checked.stdout
 
 
 def test_a_scan_is_accepted_when_none_has(

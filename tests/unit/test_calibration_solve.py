@@ -202,8 +202,28 @@ def test_what_does_not_settle_is_refused(
     procedure: VirtualProcedure, seen: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(joint, "_ITERATIONS", 1)
-    with pytest.raises(CalibrationError, match="does not settle on one booth"):
+    with pytest.raises(CalibrationError, match="the cameras contradict one another"):
         solved(procedure.booth.rig, seen)
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.2])
+def test_a_head_that_is_seen_all_along_blames_no_sound_camera(
+    procedure: VirtualProcedure, gap_s: float
+) -> None:
+    """The solution was lost: it ended in a traceback, or called a sound camera a scattering one."""
+    seen = synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
+    heads = [
+        ball
+        for time_s in procedure.starts_s(BALL) + np.arange(2.0, 58.0, gap_s)
+        for ball in synthetic.detections(
+            procedure,
+            ("front-upper", "back-upper"),
+            np.array([0.3, 0.4, 1.6]) + 0.05 * np.sin(time_s * np.array([1.0, 0.7, 0.3])),
+            time_s,
+        )
+    ]
+    with pytest.raises(CalibrationError, match="the cameras contradict one another"):
+        solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
 
 
 def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
