@@ -1,5 +1,6 @@
 """The solution on detections drawn from the sensor's own noise: poses, honesty, refusals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +74,28 @@ def test_what_it_says_of_its_own_errors_is_true() -> None:
         unknowns += len(away)
     # 72 unknowns: 99.9 % lie between 0.55 and 1.6 a piece.
     assert 0.55 < total / unknowns < 1.6
+
+
+def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None:
+    """A sensor that is twice as noisy as it claims is not believed, and priors are no noisier."""
+    seen = synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
+
+    def boasting(ball: BallDetection) -> BallDetection:
+        return replace(ball, patches=ball.patches * (1.0, 1.0, 1.0, 0.25))
+
+    def boast(balls: Sequence[BallDetection]) -> list[BallDetection]:
+        return [boasting(ball) for ball in balls]
+
+    around = {place: boast(balls) for place, balls in seen.around.items()}
+    boasted = replace(
+        seen, balls=boast(seen.balls), mark=boast(seen.mark), front=boast(seen.front), around=around
+    )
+    rig = procedure.booth.rig
+    honest, doubted = (solved(rig, observed).placed for observed in (seen, boasted))
+    sigmas = [np.sqrt(np.diag(placed.covariance)) for placed in (honest, doubted)]
+    shares = sigmas[1] / sigmas[0]
+    assert shares.max() < 1.1
+    assert np.median(shares) > 0.75
 
 
 def test_depth_errors_are_found(procedure: VirtualProcedure, solution: Solution) -> None:
