@@ -117,7 +117,7 @@ def run(config_path: Path | None) -> None:
     path = find_config(config_path)
     config = load_config(path)
     folder = config.runtime.folder
-    busy = BoothError(f"a station runs already in {folder}; stop it first")
+    busy = BoothError(f"a station runs already in {folder}; end it first (Ctrl-C in its terminal)")
     with held(folder / "station.lock", busy):
         click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
         if not config.calibration.exists():

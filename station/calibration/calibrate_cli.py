@@ -87,8 +87,8 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
 
 
 def _list(procedure: Procedure) -> None:
-    entries = list(procedure.store.entries())
-    if not entries:
+    entries, session = list(procedure.store.entries()), procedure.begun()
+    if not entries and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
         mark = "*" if entry.in_use else " "
@@ -96,9 +96,8 @@ def _list(procedure: Procedure) -> None:
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms"
         )
-    session = procedure.begun()
     if session is not None:
-        click.echo(f"  unfinished, begun {session.started}")
+        click.echo(f"  unfinished, begun {session.started}: {session.summary()}")
 
 
 @calibrate.command("floor")

@@ -12,6 +12,7 @@ from station.calibration.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide import Guide
 from station.calibration.session import AROUND, BALL, EMPTY, FRONT, MARK, SESSION, WALL, Session
 from station.calibration.steps import (
+    EMPTY_FIRST,
     covered,
     look_at_empty_booth,
     look_at_wall,
@@ -64,15 +65,15 @@ class Procedure:
         session = self.begun()
         if session is not None:
             self.guide.say(f"going on with the calibration that was begun {session.started}")
-            if session.done(MARK):
-                self.guide.say("  the ball on the mark was seen; station calibrate mark: anew")
+            self.guide.say(f"  kept: {session.summary()}; a step is done anew by its own command")
         if session is None or not session.done(EMPTY):
             self.empty()
         if session is None or not covered(session, self.config.reference).enough:
             self.ball()
         if session is None or not session.done(MARK):
             self.rest(MARK)
-        if self.recordings is not None and (self.recordings / FRONT).is_dir():
+        recorded_front = self.recordings is not None and (self.recordings / FRONT).is_dir()
+        if recorded_front and (session is None or not session.done(FRONT)):
             self.rest(FRONT)
         if session is None or len(session.around) < len(_AROUND):
             self.around(asked=True)
@@ -95,9 +96,14 @@ class Procedure:
             f"booth for {wanted.waving_s:g} s: low and high, left and right, around the mark.",
         )
         with self._feed(BALL) as (feed, session):
+            self._remark_on_ghosts(session)
             wave_ball(
                 feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
             )
+        if covered(session, self.config.reference).enough:
+            from station.calibration.refusals import check_radius
+
+            check_radius(session.balls, session.radius_m)
 
     def rest(self, step: str) -> None:
         """The ball on the mark, or in front of it."""
@@ -125,6 +131,8 @@ class Procedure:
         """The flat board at as many places as the operator (or the recordings) likes."""
         # Live, a further board is added to those that were seen; recordings have their own places.
         session = self.begun()
+        if session is None or not session.done(EMPTY):
+            raise CalibrationError(EMPTY_FIRST)
         before = session.wall_count if session and self.recordings is None else 0
         for place in range(before, before + _MOST_BOARDS):
             if self.recordings is not None:
@@ -146,6 +154,7 @@ class Procedure:
         from station.calibration.solve import solve
 
         session = self.session()
+        self._check_radius(session)
         self.guide.title("Solution")
         solution = solve(
             session.observations(),
@@ -165,7 +174,15 @@ class Procedure:
     def _lay(self, step: str, where: str, exactly: str = "") -> None:
         self.guide.step(f"Ball {where}", f"Lay the ball {where}{exactly}; then step back.")
         with self._feed(step) as (feed, session):
+            self._remark_on_ghosts(session)
             rest_ball(feed, session, self.guide, step)
+
+    def _remark_on_ghosts(self, session: Session) -> None:
+        if not session.done(EMPTY):
+            self.guide.say(
+                "the empty booth was not looked at: what is round in it may be taken for the ball "
+                "(station calibrate floor)"
+            )
 
     @contextmanager
     def _feed(self, step: str) -> Iterator[tuple[Feed, Session]]:

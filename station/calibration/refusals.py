@@ -39,6 +39,8 @@ AROUND_WORDS = (
 
 
 def check_counts(covered: Coverage) -> None:
+    if not any(covered.counts().values()):
+        raise CalibrationError("the ball has not been waved yet: station calibrate ball")
     for name, count in covered.counts().items():
         if count < _LEAST_DETECTIONS:
             raise CalibrationError(
@@ -57,7 +59,8 @@ def check_radius(balls: Sequence[BallDetection], radius_m: float) -> float:
     if abs(measured / radius_m - 1.0) > _RADIUS_SHARE:
         raise CalibrationError(
             f"the ball measures {1e3 * measured:.0f} mm in radius, but {1e3 * radius_m:.0f} mm was "
-            f"given: measure it and give its radius, or use the right ball"
+            f"given: use the right ball, or correct calibrate.ball_radius_m; then begin anew with "
+            f"station calibrate --new"
         )
     return measured
 

@@ -134,6 +134,18 @@ class Session:
             return any(name.startswith(WALL) for name in self.planes)
         return step in self.planes
 
+    def summary(self) -> str:
+        """What was seen so far, in words."""
+        parts = {
+            "the empty booth": self.done(EMPTY),
+            f"{len(self.balls)} sightings of the waved ball": bool(self.balls),
+            "the ball on the mark": self.done(MARK),
+            "the ball in front of it": self.done(FRONT),
+            f"{len(self.around)} places around it": bool(self.around),
+            f"{self.wall_count} boards": self.done(WALL),
+        }
+        return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
+
     def background(self, camera: str) -> StaticView | None:
         """The empty booth as a camera sees it, if that was looked at."""
         path = self.folder / SCENE / f"{camera}.npz"

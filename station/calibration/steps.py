@@ -17,6 +17,7 @@ from station.calibration.scene import Image, smoothed, static_view
 from station.calibration.session import Session
 from station.errors import CalibrationError
 
+EMPTY_FIRST = "the empty booth has to be looked at first: station calibrate floor"
 _EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
@@ -66,9 +67,7 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     for camera, (stack, scale_m) in taken.items():
         background = _background(session, camera)
         if background is None:
-            raise CalibrationError(
-                "the empty booth has to be looked at first: station calibrate floor"
-            )
+            raise CalibrationError(EMPTY_FIRST)
         wall = observe_wall(stack, scale_m, cameras[camera], name, background)
         if wall is not None:
             walls.append(wall)

@@ -76,6 +76,31 @@ def test_after_a_finished_calibration_solve_says_so(config: Path, store: Calibra
     assert "station calibrate begins another" in str(refused.exception)
 
 
+def test_a_solution_takes_the_ball_that_was_waved(config: Path, store: CalibrationStore) -> None:
+    """With another radius in booth.toml since, it went into use without a word."""
+    _begin(store)
+    refused = _run(config, "solve")
+    assert "the ball has not been waved yet: station calibrate ball" in str(refused.exception)
+    config.write_text("[calibrate]\nball_radius_m = 0.12\n" + config.read_text())
+    refused = _run(config, "solve")
+    assert "with a ball of 0.1 m and booth.toml says 0.12 m" in str(refused.exception)
+    assert "station calibrate --new" in str(refused.exception)
+
+
+def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore) -> None:
+    _begin(store)
+    listed = _run(config, "--list").output
+    assert listed == "  unfinished, begun 2026-11-21T10:00:00Z: nothing yet\n"
+
+
+def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationStore) -> None:
+    """The operator had set up the board before he was told."""
+    _begin(store)
+    refused = _run(config, "depth")
+    assert "the empty booth has to be looked at first" in str(refused.exception)
+    assert "board" not in refused.output
+
+
 def test_a_step_reads_its_own_configuration(tmp_path: Path) -> None:
     """The group once read booth.toml before the step could say which."""
     missing = CliRunner().invoke(calibrate, ["solve", "--config", str(tmp_path / "other.toml")])
