@@ -32,7 +32,7 @@ format: $(VENV)/dev.stamp
 	$(BIN)/ruff format .
 
 train: $(VENV)/train.stamp
-	$(BIN)/reconstruct train --out workers/scape/data/body.npz
+	$(BIN)/reconstruct train --out workers/scape/model/data/body.npz
 
 evaluate-model: $(VENV)/train.stamp
 	$(BIN)/reconstruct evaluate-model $(ARGS)
@@ -55,7 +55,7 @@ $(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
 $(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@echo "compiling what the first scan would otherwise wait for"
-	$(BIN)/python -c "from workers.job import warm_up; warm_up()"
+	$(BIN)/python -c "from workers.reconstruct.job import warm_up; warm_up()"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from station.calibration.rig import Rig
-from station.drivers.freenect import find_library
-from station.drivers.virtual_cli import PROCEDURE, TRUTH
-from station.errors import DriverError
-from station.geometry import invert, so3_log
+from station.core.errors import DriverError
+from station.core.geometry import invert, so3_log
+from station.core.rig import Rig
+from station.sensors.freenect import find_library
+from station.simulation.record_cli import PROCEDURE, TRUTH
 
-BODY = Path(__file__).parents[1] / "station/data/bodies/ann.npz"
+BODY = Path(__file__).parents[1] / "station/simulation/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
 WAVING_S = 24
 

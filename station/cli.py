@@ -5,21 +5,24 @@ from __future__ import annotations
 import click
 
 from station import __version__
-from station.lazy_group import LazyGroup, run
+from station.core.lazy_group import LazyGroup, run
 
 COMMANDS = {
-    "run": ("station.supervisor:run", "run the whole booth in the foreground"),
-    "start": ("station.operator_cli:start", "start the sensors"),
-    "scan": ("station.operator_cli:scan", "scan the person in the booth"),
-    "status": ("station.operator_cli:status", "show cameras, scans and workers"),
-    "stop": ("station.operator_cli:stop", "stop the sensors"),
-    "calibrate": ("station.calibration.calibrate_cli:calibrate", "find where the cameras are"),
-    "check": ("station.calibration.check_cli:check", "has a camera moved since?"),
-    "purge": ("station.retention:purge", "delete a scan and its results"),
-    "capture": ("station.capture:capture", "one camera's capture process"),
-    "sync": ("station.sync:sync", "the sync-and-merge process"),
-    "control": ("station.control:control", "the operator's endpoint"),
-    "record-virtual": ("station.drivers.virtual_cli:record_virtual", "record a virtual person"),
+    "run": ("station.booth.supervisor:run", "run the whole booth in the foreground"),
+    "start": ("station.booth.operator_cli:start", "start the sensors"),
+    "scan": ("station.booth.operator_cli:scan", "scan the person in the booth"),
+    "status": ("station.booth.operator_cli:status", "show cameras, scans and workers"),
+    "stop": ("station.booth.operator_cli:stop", "stop the sensors"),
+    "calibrate": (
+        "station.calibration.guide.calibrate_cli:calibrate",
+        "find where the cameras are",
+    ),
+    "check": ("station.calibration.drift.check_cli:check", "has a camera moved since?"),
+    "purge": ("station.booth.retention:purge", "delete a scan and its results"),
+    "capture": ("station.booth.capture:capture", "one camera's capture process"),
+    "sync": ("station.booth.sync:sync", "the sync-and-merge process"),
+    "control": ("station.booth.control:control", "the operator's endpoint"),
+    "record-virtual": ("station.simulation.record_cli:record_virtual", "record a virtual person"),
 }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-BODIES = Path(__file__).parents[1] / "station/data/bodies"
+BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 STATION = (sys.executable, "-m", "station.cli")
 
 
@@ -27,8 +27,8 @@ def booth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan bundle of another body, on an ordinary day."""
-    from station.drivers.virtual import SimulatedBooth, render_bundle
-    from station.drivers.virtual_scene import load_mesh
+    from station.simulation.scene import load_mesh
+    from station.simulation.sensor import SimulatedBooth, render_bundle
 
     folder = tmp_path_factory.mktemp("bundles") / "ben"
     return render_bundle(load_mesh(BODIES / "ben.npz"), folder, SimulatedBooth(seed=4))

@@ -12,18 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration import depth_correction
-from station.calibration.depth_correction import MIDDLE, correction_of
-from station.calibration.detections import FLOOR, BallDetection, Observations, PlaneObservation
-from station.calibration.joint import ball_inverse_depth, local_equations
-from station.calibration.problem import Sightings
-from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
-from station.calibration.sensor_noise import ROUNDING, SQUARE_ERROR
-from station.drivers.virtual import SimulatedBooth, SimulatedUnit
-from station.drivers.virtual_calibration import AROUND, BALL, VirtualProcedure
-from station.drivers.virtual_noise import UnitError
-from station.drivers.virtual_scene import default_rig
-from station.geometry import invert, se3_exp, transform
+from station.calibration.detect.detections import (
+    FLOOR,
+    BallDetection,
+    Observations,
+    PlaneObservation,
+)
+from station.calibration.solve import depth_correction
+from station.calibration.solve.depth_correction import MIDDLE, correction_of
+from station.calibration.solve.joint import ball_inverse_depth, local_equations
+from station.calibration.solve.problem import Sightings
+from station.core.geometry import invert, se3_exp, transform
+from station.core.kinect_v1 import ROUNDING, SQUARE_ERROR
+from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.simulation.noise import UnitError
+from station.simulation.procedure import AROUND, BALL, VirtualProcedure
+from station.simulation.scene import default_rig
+from station.simulation.sensor import SimulatedBooth, SimulatedUnit
 
 Array = NDArray[np.float64]
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import click
 
 from station import __version__
-from station.lazy_group import LazyGroup, run
+from station.core.lazy_group import LazyGroup, run
 
 COMMANDS = {
-    "fit": ("workers.fit_cli:fit", "reconstruct one scan bundle or point cloud"),
-    "work": ("workers.pool:work", "serve the spool's queue"),
-    "measure": ("workers.measure.cli:measure", "measure a result or a mesh"),
-    "train": ("workers.scape.cli:train", "learn the body model from a database"),
-    "evaluate-model": ("workers.scape.cli:evaluate_model", "test the model on held-out bodies"),
+    "fit": ("workers.reconstruct.fit_cli:fit", "reconstruct one scan bundle or point cloud"),
+    "work": ("workers.reconstruct.pool:work", "serve the spool's queue"),
+    "measure": ("workers.reconstruct.measure_cli:measure", "measure a result or a mesh"),
+    "train": ("workers.scape.learn.cli:train", "learn the body model from a database"),
+    "evaluate-model": (
+        "workers.scape.learn.cli:evaluate_model",
+        "test the model on held-out bodies",
+    ),
 }
 
 

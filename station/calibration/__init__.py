@@ -1,1 +1,3 @@
-"""Where the cameras are: the rig itself, how it is found, and how staleness is noticed."""
+"""Where the cameras are, how this is found out, and how a camera that moved is noticed.
+The calibration file itself is `station.core.rig`.
+"""

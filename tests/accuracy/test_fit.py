@@ -10,16 +10,17 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from station.bundle import read_bundle
-from station.depth import PointCloud, Preprocessed, preprocess
-from station.geometry import so3_exp
-from workers.point_cloud import _consistent, read_cloud
-from workers.scape.deformation import vertex_normals
-from workers.scape.fit import FitResult, fit_body
-from workers.scape.intersections import self_intersections, turned_over
-from workers.scape.model import BodyModel, load_model
+from station.core.bundle import read_bundle
+from station.core.geometry import so3_exp
+from workers.cloud.bare import _consistent, read_cloud
+from workers.cloud.observed import PointCloud, Preprocessed
+from workers.cloud.preprocess import preprocess
+from workers.scape.fit.fit import FitResult, fit_body
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.surface.intersections import self_intersections, turned_over
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 @pytest.fixture(scope="module")

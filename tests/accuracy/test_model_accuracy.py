@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.scape.cache import FOLDER_VARIABLE
-from workers.scape.model import BodyModel, load_model
-from workers.scape.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.cache import FOLDER_VARIABLE
 
 pytest.importorskip("anny", reason="the generator of bodies comes with the train extra")
 
-from workers.scape.database import POPULATION, BodyDatabase
-from workers.scape.train import TrainingPlan, train
+from workers.scape.learn.database import POPULATION, BodyDatabase
+from workers.scape.learn.train import TrainingPlan, train
 
 BODIES = 5
 

@@ -25,22 +25,22 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_drift
 import synthetic_calibration as synthetic
 
-from station.bundle import read_bundle
-from station.calibration.detections import Observations
-from station.calibration.rig import Rig
-from station.calibration.simulated import simulate
-from station.calibration.solve import solve
-from station.calibration.world import relatives, twist_between
-from station.depth import preprocess
-from station.drivers.virtual import SimulatedBooth, SimulatedUnit, render_bundle
-from station.drivers.virtual_calibration import VirtualProcedure
-from station.drivers.virtual_scene import Mesh, load_mesh
-from station.errors import CalibrationError
-from station.geometry import invert
+from station.calibration.detect.detections import Observations
+from station.calibration.solve.solution import solve
+from station.calibration.solve.world import relatives, twist_between
+from station.core.bundle import read_bundle
+from station.core.errors import CalibrationError
+from station.core.geometry import invert
+from station.core.rig import Rig
+from station.simulation.observations import simulate
+from station.simulation.procedure import VirtualProcedure
+from station.simulation.scene import Mesh, load_mesh
+from station.simulation.sensor import SimulatedBooth, SimulatedUnit, render_bundle
+from workers.cloud.preprocess import preprocess
 
 Array = NDArray[np.float64]
 
-_BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+_BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 _CYLINDER_M = (0.15, 1.7)
 _REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
 

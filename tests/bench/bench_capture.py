@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 
-BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
 
 

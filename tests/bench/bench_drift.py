@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from station.calibration.drift import (
+from station.calibration.detect.scene import StaticView, static_view
+from station.calibration.drift.motion import (
     LEVER_M,
     MOVED_M,
     MOVED_RAD,
@@ -22,15 +23,14 @@ from station.calibration.drift import (
     DriftReference,
     estimate_move,
 )
-from station.calibration.rig import CameraCalibration
-from station.calibration.scene import StaticView, static_view
-from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual import SimulatedBooth, SimulatedUnit
-from station.drivers.virtual_noise import NoiselessView, TrueView
-from station.drivers.virtual_scene import Mesh, VirtualScene, fixed_posts, load_mesh
-from station.geometry import se3_exp
+from station.core.geometry import se3_exp
+from station.core.rig import CameraCalibration
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.simulation.noise import NoiselessView, TrueView
+from station.simulation.scene import Mesh, VirtualScene, fixed_posts, load_mesh
+from station.simulation.sensor import SimulatedBooth, SimulatedUnit
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 STORED_FRAMES, SCAN_FRAMES, CHECK_FRAMES = 45, 10, 30
 FALSE_ALARMS_BAR = 1e-3
 

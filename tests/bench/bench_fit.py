@@ -50,16 +50,17 @@ from fit_report import (
 from numpy.typing import NDArray
 from surface_errors import surface_errors
 
-from station.bundle import read_bundle
-from station.depth import Preprocessed, Volume, preprocess
-from station.drivers.virtual import render_bundle
-from station.drivers.virtual_scene import Mesh
-from station.errors import BoothError
-from workers.job import reconstruct_bundle, warm_up
-from workers.scape.fit import fit_body, sampling_of
-from workers.scape.initial import starting_states
-from workers.scape.model import BodyModel
-from workers.scape.verdict import words_of
+from station.core.bundle import read_bundle
+from station.core.errors import BoothError
+from station.simulation.scene import Mesh
+from station.simulation.sensor import render_bundle
+from workers.cloud.observed import Preprocessed
+from workers.cloud.preprocess import Volume, preprocess
+from workers.reconstruct.job import reconstruct_bundle, warm_up
+from workers.scape.fit.fit import fit_body, sampling_of
+from workers.scape.fit.initial import starting_states
+from workers.scape.fit.verdict import words_of
+from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
@@ -189,7 +190,8 @@ class WorkerRun:
 
 _WORKER = """
 import resource, subprocess, sys
-done = subprocess.run([sys.executable, "-m", "workers.job_process"], stdout=subprocess.DEVNULL)
+job = [sys.executable, "-m", "workers.reconstruct.job_process"]
+done = subprocess.run(job, stdout=subprocess.DEVNULL)
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, done.returncode)
 """
 

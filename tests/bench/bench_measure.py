@@ -22,20 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 from true_measurements import TrueBody
 
-from station.bundle import read_bundle
-from station.depth import preprocess
-from station.drivers.virtual import SimulatedBooth, render_bundle
-from station.drivers.virtual_scene import Mesh, default_rig
-from workers.job import warm_up
+from station.core.bundle import read_bundle
+from station.simulation.scene import Mesh, default_rig
+from station.simulation.sensor import SimulatedBooth, render_bundle
+from workers.cloud.preprocess import preprocess
 from workers.measure import intervals
 from workers.measure.body import Content, MeasuredBody, measure_body, measure_standing
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.intervals import Pose, learned, line_sigma, sides_pooled, to_document
 from workers.measure.standing import standard_turns, stood_upright
 from workers.measure.tracing import trace_all
-from workers.scape.database import PARTS, BodyDatabase, Shapes, Split
-from workers.scape.fit import FitResult, fit_body
-from workers.scape.model import BodyModel
+from workers.reconstruct.job import warm_up
+from workers.scape.fit.fit import FitResult, fit_body
+from workers.scape.learn.database import PARTS, BodyDatabase, Shapes, Split
+from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from station.calibration.rig import Rig
-from station.depth import PointCloud
-from station.drivers.virtual import SimulatedBooth
-from station.drivers.virtual_scene import Mesh, box, chair, default_rig, look_at
-from station.geometry import rigid, so3_exp
-from workers.scape.database import PARTS, BodyDatabase, Shapes
-from workers.scape.intersections import self_intersections
+from station.core.geometry import rigid, so3_exp
+from station.core.rig import Rig
+from station.simulation.scene import Mesh, box, chair, default_rig, look_at
+from station.simulation.sensor import SimulatedBooth
+from workers.cloud.observed import PointCloud
+from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
+from workers.scape.surface.intersections import self_intersections
 
 Array = NDArray[np.float64]
 Group = Literal["family", "other", "hard", "rig", "bad"]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from surface_errors import distances_m
 
-from station.drivers.virtual_scene import Mesh
-from workers.render import VIEWS, Frame, Scene, png, write_text
+from station.simulation.scene import Mesh
+from workers.pictures.render import VIEWS, Frame, Scene, png, write_text
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from fit_cases import Case
 from surface_errors import SurfaceErrors
 
-from workers.scape.fit import FitResult
-from workers.scape.verdict import words_of
+from workers.scape.fit.fit import FitResult
+from workers.scape.fit.verdict import words_of
 
 _LOST_MM = 15.0
 _PAPERS_SECONDS = 60.0

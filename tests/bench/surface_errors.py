@@ -9,9 +9,9 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from station.drivers.virtual_scene import Mesh
-from workers.scape.deformation import vertex_areas
-from workers.scape.model import HAND, BodyModel
+from station.simulation.scene import Mesh
+from workers.scape.model.body_model import HAND, BodyModel
+from workers.scape.model.deformation import vertex_areas
 
 Array = NDArray[np.float64]
 

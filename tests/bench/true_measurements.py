@@ -22,7 +22,7 @@ from workers.measure.definitions import (
     Tilted,
     Top,
 )
-from workers.scape.model import BodyModel
+from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from station.bundle import read_bundle
-from station.depth import preprocess
-from workers.job import reconstruct_bundle, reconstruct_cloud
-from workers.scape.model import load_model
+from station.core.bundle import read_bundle
+from workers.cloud.preprocess import preprocess
+from workers.reconstruct.job import reconstruct_bundle, reconstruct_cloud
+from workers.scape.model.body_model import load_model
 
 SHA = "0" * 64
 SCHEMAS = {
     "result": "workers.export",
     "measurements": "workers.export",
-    "bundle": "station.data",
-    "calibration": "station.data",
+    "bundle": "station.core",
+    "calibration": "station.core",
 }
 IDENTITY = np.eye(4).tolist()
 CAMERA = {

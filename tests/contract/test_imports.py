@@ -3,29 +3,30 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-STATION_FOR_WORKERS = (
-    "station.errors",
-    "station.files",
-    "station.geometry",
-    "station.config",
-    "station.messages",
-    "station.bundle",
-    "station.spool",
-    "station.depth",
-    "station.calibration.rig",
-    "station.calibration.drift",
-    "station.lazy_group",
-    "station.service",
-    "station",
+PURE = (
+    "station/booth/frameset.py",
+    "station/booth/session.py",
+    "station/sensors/clock.py",
+    "station/core/geometry.py",
+    "station/core/lens.py",
 )
-PURE = ("station/frameset.py", "station/session.py", "station/clock.py", "station/geometry.py")
-OPEN3D = ("workers/", "station/drivers/virtual")
+PURE_FOLDERS = (
+    "station/calibration/detect",
+    "station/calibration/solve",
+    "workers/cloud",
+    "workers/scape",
+    "workers/measure",
+)
+OPEN3D = ("workers/", "station/simulation/")
+MOST_MODULES = 14
 
 
 def _imports(path: Path) -> Iterator[str]:
@@ -56,28 +57,82 @@ def test_station_never_imports_workers() -> None:
     assert offenders == []
 
 
-def test_workers_import_little_of_the_station() -> None:
+def test_workers_import_the_core_of_the_station_alone() -> None:
     """A bundle must be reconstructable on a machine that has no booth."""
     offenders = [
         (path, module)
         for path in _sources("workers")
         for module in _imports(path)
         if _under(module, ("station",))
-        and not (module == "station" or _under(module, STATION_FOR_WORKERS[:-1]))
-        and module != "station.__version__"
+        and module not in ("station", "station.__version__")
+        and not _under(module, ("station.core",))
     ]
     assert offenders == []
 
 
+def test_the_fit_never_imports_the_learning() -> None:
+    """What learns the model needs torch and a database; a booth has neither."""
+    offenders = [
+        (path, module)
+        for path in _sources("station", "workers")
+        if not path.is_relative_to(ROOT / "workers/scape/learn")
+        for module in _imports(path)
+        if _under(module, ("workers.scape.learn",))
+    ]
+    assert offenders == []
+
+
+def test_nothing_imports_the_simulation() -> None:
+    """The product must not depend on its own test bench; drivers are found by entry points."""
+    offenders = [
+        (path, module)
+        for path in _sources("station", "workers")
+        if not path.is_relative_to(ROOT / "station/simulation")
+        for module in _imports(path)
+        if _under(module, ("station.simulation",))
+    ]
+    assert offenders == []
+
+
+def test_folders_import_each_other_in_one_direction() -> None:
+    """A circle of folders has no bottom: a stranger finds no place to begin reading."""
+    arrows: dict[str, set[str]] = {}
+    for path in _sources("station", "workers"):
+        folder = str(path.parent.relative_to(ROOT)).replace("/", ".")
+        for module in _imports(path):
+            target = ROOT / module.replace(".", "/")
+            if (
+                target.with_suffix(".py").exists()
+                and (other := module.rpartition(".")[0]) != folder
+            ):
+                arrows.setdefault(folder, set()).add(other)
+    TopologicalSorter(arrows).prepare()
+
+
+def test_no_folder_is_too_wide_to_find_a_module_in() -> None:
+    folders = Counter(path.parent for path in _sources("station", "workers"))
+    wide = {
+        str(folder): count
+        for folder, count in folders.items()
+        if count > MOST_MODULES + (folder / "__init__.py").exists()
+    }
+    assert wide == {}
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("*/**/__init__.py")), ids=str)
+def test_every_package_says_what_belongs_there(path: Path) -> None:
+    if path.parts[len(ROOT.parts)] in ("station", "workers"):
+        assert len((ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()) >= 1
+
+
 def test_mathematics_opens_no_sockets() -> None:
     pure = [ROOT / name for name in PURE]
-    pure += _sources("workers/scape", "workers/measure", "station/depth")
+    pure += _sources(*PURE_FOLDERS)
     offenders = [
         (path, module)
         for path in pure
-        if path.exists()
         for module in _imports(path)
-        if _under(module, ("zmq", "socket", "station.transport"))
+        if _under(module, ("zmq", "socket", "station.messaging.transport"))
     ]
     assert offenders == []
 
@@ -92,7 +147,7 @@ def test_open3d_stays_out_of_the_capture_processes() -> None:
     assert offenders == []
 
 
-@pytest.mark.parametrize("module", ["station.capture", "station.cli", "workers.cli"])
+@pytest.mark.parametrize("module", ["station.booth.capture", "station.cli", "workers.cli"])
 def test_a_light_process_stays_light(module: str) -> None:
     """open3d is 0.5 s and 230 MB: four capture processes cannot each carry it."""
     program = f"import sys, {module}; print(*sys.modules)"

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from station.config import CameraConfig
-from station.drivers.freenect import LIBRARY_VARIABLE, FreenectDriver, find_library
-from station.drivers.registry import make_driver
-from station.errors import DriverError
-from station.spool import Spool
+from station.core.config import CameraConfig
+from station.core.errors import DriverError
+from station.core.spool import Spool
+from station.sensors.freenect import LIBRARY_VARIABLE, FreenectDriver, find_library
+from station.sensors.registry import make_driver
 
 STATION = (sys.executable, "-m", "station.cli")
 
@@ -55,7 +55,7 @@ def test_a_camera_that_dies_in_a_scan_fails_it_by_name(make_station: Callable[..
     assert done.returncode == 1
     assert "failed" in done.stderr
     assert "front-lower" in done.stderr
-    assert not list((station.config.parent / "spool/queue").iterdir())
+    assert not list((station.core.config.parent / "spool/queue").iterdir())
 
 
 def test_a_camera_absent_from_the_calibration_is_named(
@@ -65,12 +65,12 @@ def test_a_camera_absent_from_the_calibration_is_named(
     del document["cameras"]["back-upper"]
     (tmp_path / "partial.json").write_text(json.dumps(document))
     station = make_station("[workers]\ncount = 0", _recorded)
-    text = station.config.read_text()
+    text = station.core.config.read_text()
     station.close()
-    station.config.write_text(
+    station.core.config.write_text(
         text.replace(f"{booth}/calibration.json", str(tmp_path / "partial.json"))
     )
-    again = type(station)(station.config)
+    again = type(station)(station.core.config)
     try:
         assert again.command("start").returncode == 0
         refused = again.command("scan")
@@ -115,7 +115,7 @@ def test_commands_without_a_station_end_with_the_remedy(booth: Path, tmp_path: P
 def test_one_station_to_a_runtime_folder(make_station: Callable[..., object]) -> None:
     station = make_station("[workers]\ncount = 0", _recorded)
     second = subprocess.run(
-        [*STATION, "run", "--config", str(station.config)],
+        [*STATION, "run", "--config", str(station.core.config)],
         capture_output=True, text=True, timeout=20, check=False,
     )  # fmt: skip
     assert second.returncode == 1

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from station.calibration.scene import static_view
-from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
-from station.drivers.virtual_scene import Mesh, fixed_posts, load_mesh
-from station.recording import write_recording
+from station.calibration.detect.scene import static_view
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.sensors.recording import write_recording
+from station.simulation.scene import Mesh, fixed_posts, load_mesh
+from station.simulation.sensor import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
 
 STATION = (sys.executable, "-m", "station.cli")
-BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 BUMPED = {"front-upper": (0.006, 0.004)}
 """6 mm and 0.23 degrees."""
 
@@ -76,7 +76,7 @@ def test_a_scan_is_refused_when_a_camera_has_moved(
     assert "camera front-upper has moved since it was calibrated" in done.stderr
     assert "station calibrate" in done.stderr
     assert not any(name in done.stderr for name in ("front-lower", "back-lower", "back-upper"))
-    assert not list((station.config.parent / "spool/queue").iterdir())
+    assert not list((station.core.config.parent / "spool/queue").iterdir())
     checked = station.command("check")
     assert checked.returncode == 3
     assert "camera front-upper has moved" in checked.stdout

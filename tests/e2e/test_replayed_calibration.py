@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.calibration.rig import Rig
-from station.calibration.session import Session
-from station.drivers.freenect import find_library
-from station.drivers.virtual_cli import PROCEDURE, TRUTH
-from station.errors import DriverError
-from station.geometry import invert, so3_log
+from station.calibration.guide.session import Session
+from station.core.errors import DriverError
+from station.core.geometry import invert, so3_log
+from station.core.rig import Rig
+from station.sensors.freenect import find_library
+from station.simulation.record_cli import PROCEDURE, TRUTH
 
 STATION = (sys.executable, "-m", "station.cli")
-BODY = Path(__file__).parents[2] / "station/data/bodies/ann.npz"
+BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 
 
 def _driver() -> str:
@@ -89,6 +89,6 @@ def test_live_cameras_are_looked_at_like_recordings(make_station: Callable[..., 
     done = station.command("calibrate", "floor", "--yes")
     assert done.returncode == 0, done.stderr
     assert "empty booth kept" in done.stdout
-    session = Session.load(station.config.parent / "calibrations/unfinished")
+    session = Session.load(station.core.config.parent / "calibrations/unfinished")
     assert set(session.cameras) == {"front-lower", "front-upper", "back-lower", "back-upper"}
     assert session.background("back-upper") is not None

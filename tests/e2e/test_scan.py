@@ -11,10 +11,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from station.drivers.freenect import find_library
-from station.errors import DriverError
+from station.core.errors import DriverError
+from station.sensors.freenect import find_library
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 def _has_replay_library() -> bool:
@@ -48,7 +48,7 @@ def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..
     done = station.command("scan", "--label", "Order 7", "--scan-id", "20260101T000000Z-0001")
     assert done.returncode in (0, 3), done.stderr + station.log.read_text()
     assert "the person may leave" in done.stdout or "reconstructing" in done.stdout
-    result = station.config.parent / "spool/outbox/20260101T000000Z-0001"
+    result = station.core.config.parent / "spool/outbox/20260101T000000Z-0001"
     assert str(result) in done.stdout
     document = json.loads((result / "result.json").read_text())
     for name, digest in document["files"].items():
@@ -56,7 +56,7 @@ def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..
     assert _surface_rms_m(result, "ann") < 0.008
     again = station.command("scan", "--scan-id", "20260101T000000Z-0001")
     assert again.returncode == done.returncode
-    spool = station.config.parent / "spool"
+    spool = station.core.config.parent / "spool"
     assert [entry.name for entry in (spool / "outbox").iterdir()] == ["20260101T000000Z-0001"]
     bundle = json.loads((spool / "done/20260101T000000Z-0001/bundle.json").read_text())
     assert bundle["label"] == "Order 7"
@@ -84,11 +84,11 @@ def test_killed_processes_lose_no_scan(make_station: Callable[..., object]) -> N
     assert station.command("start").returncode == 0
     taken = station.command("scan", "--no-wait", "--scan-id", "20260101T000000Z-0002")
     assert taken.returncode == 0, taken.stderr
-    spool = station.config.parent / "spool"
+    spool = station.core.config.parent / "spool"
     station.wait_until(
         lambda: (spool / "work/20260101T000000Z-0002").exists(), "a worker claims it"
     )
-    for pid in station.pids("workers.job_process"):
+    for pid in station.pids("workers.reconstruct.job_process"):
         os.kill(pid, signal.SIGKILL)
     station.wait_until(
         lambda: (spool / "outbox/20260101T000000Z-0002").exists(), "it is delivered", 120.0
@@ -119,7 +119,7 @@ def test_a_full_disk_refuses_before_the_scan(make_station: Callable[..., object]
     refused = station.command("scan")
     assert refused.returncode == 1
     assert "MB free" in refused.stderr
-    assert not list((station.config.parent / "spool/queue").iterdir())
+    assert not list((station.core.config.parent / "spool/queue").iterdir())
 
 
 @needs_replay

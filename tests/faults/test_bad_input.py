@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.drivers.virtual import SimulatedBooth, render_bundle
-from station.drivers.virtual_scene import Mesh, chair, load_mesh
+from station.simulation.scene import Mesh, chair, load_mesh
+from station.simulation.sensor import SimulatedBooth, render_bundle
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 def _fit(bundle: Path, out: Path, *options: str) -> subprocess.CompletedProcess[str]:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from station.calibration.session import BALL, EMPTY, JOURNAL, Session
-from station.drivers.virtual import TICK_HZ
-from station.drivers.virtual_calibration import VirtualProcedure
-from station.recording import RecordedFrame, write_recording
+from station.calibration.guide.session import BALL, EMPTY, JOURNAL, Session
+from station.sensors.recording import RecordedFrame, write_recording
+from station.simulation.procedure import VirtualProcedure
+from station.simulation.sensor import TICK_HZ
 
 STATION = (sys.executable, "-m", "station.cli")
 CAMERAS = ("front-lower", "front-upper")

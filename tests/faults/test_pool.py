@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from station.spool import REASON, Spool
+from station.core.spool import REASON, Spool
 
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
 
@@ -60,8 +60,8 @@ def test_a_bad_bundle_fails_once_with_its_reason(
 
 
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
-    from station.config import RetentionConfig
-    from station.retention import expire_old
+    from station.booth.retention import expire_old
+    from station.core.config import RetentionConfig
 
     for state in ("done", "outbox", "queue"):
         spool.path(state, "a").mkdir()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from station.errors import SpoolError
-from station.spool import REASON, Spool
+from station.core.errors import SpoolError
+from station.core.spool import REASON, Spool
 
 
 def _submit(spool: Spool, scan_id: str) -> None:
@@ -50,7 +50,7 @@ def _claim_and_hang(folder: Path, step: str) -> None:
     claim = spool.claim()
     assert claim is not None
     if step == "delivered":
-        from station.files import publish_folder
+        from station.core.files import publish_folder
 
         publish_folder(_result(spool, claim.scan_id), spool.path("outbox", claim.scan_id))
     (folder / "ready").touch()

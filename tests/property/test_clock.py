@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from station.clock import DeviceClock
+from station.sensors.clock import DeviceClock
 
 _HZ = 60e6
 

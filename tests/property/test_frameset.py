@@ -1,7 +1,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from station.frameset import FramesetMatcher
+from station.booth.frameset import FramesetMatcher
 
 _CAMERAS = ("a", "b", "c", "d")
 

@@ -3,7 +3,7 @@ from typing import get_args
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.session import FINAL, ON_DISK, Session, State, advance, expire
+from station.booth.session import FINAL, ON_DISK, Session, State, advance, expire
 
 
 @given(events=st.lists(st.sampled_from(get_args(State)), max_size=20))

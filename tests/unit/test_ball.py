@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.calibration.ball import find_ball
-from station.calibration.detections import BallDetection, PlaneObservation
-from station.calibration.planes import observe_floor, observe_wall
-from station.calibration.rig import CameraCalibration
-from station.depth.average import average
-from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual import SimulatedBooth
-from station.drivers.virtual_calibration import BALL, EMPTY, VirtualProcedure
-from station.drivers.virtual_noise import UnitError, observe
-from station.drivers.virtual_round import Capsule, ball, overlay
-from station.drivers.virtual_scene import VirtualScene, booth_walls, default_rig, look_at, sphere
-from station.errors import FormatError
-from station.geometry import invert, se3_exp, transform
+from station.calibration.detect.ball import find_ball
+from station.calibration.detect.detections import BallDetection, PlaneObservation
+from station.calibration.detect.planes import observe_floor, observe_wall
+from station.core.errors import FormatError
+from station.core.geometry import invert, se3_exp, transform
+from station.core.rig import CameraCalibration
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.simulation.noise import UnitError, observe
+from station.simulation.procedure import BALL, EMPTY, VirtualProcedure
+from station.simulation.round_objects import Capsule, ball, overlay
+from station.simulation.scene import VirtualScene, booth_walls, default_rig, look_at, sphere
+from station.simulation.sensor import SimulatedBooth
+from workers.cloud.average import average
 
 CENTER = np.array([0.1, 0.05, 1.3])
 

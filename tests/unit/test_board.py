@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from station.calibration.board import Board, BoardView, check_ties, find_board, judge_lens
-from station.calibration.rig import CameraCalibration
-from station.drivers.virtual_scene import default_rig
-from station.errors import CalibrationError
-from station.geometry import invert, rigid, se3_exp, so3_exp
+from station.calibration.detect.board import Board, BoardView, check_ties, find_board, judge_lens
+from station.core.errors import CalibrationError
+from station.core.geometry import invert, rigid, se3_exp, so3_exp
+from station.core.rig import CameraCalibration
+from station.simulation.scene import default_rig
 
 BOARD = Board(7, 5, 0.06, 0.045)
 _DRAWN_PX = 60

@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.bundle import CapturedFrame, read_bundle, write_bundle
-from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
-from station.errors import BundleError, CalibrationError, FormatError
+from station.core.bundle import CapturedFrame, read_bundle, write_bundle
+from station.core.errors import BundleError, CalibrationError, FormatError
+from station.core.rig import CameraCalibration, DepthCorrection, Rig
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.scape.cache import FOLDER_VARIABLE, Arrays, cached_arrays
+from workers.scape.model.cache import FOLDER_VARIABLE, Arrays, cached_arrays
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from station.calibration.board import Board
-from station.calibration.calibrate_cli import calibrate
-from station.calibration.guide import Guide
-from station.calibration.rig import Rig
-from station.calibration.session import Session
-from station.calibration.store import CalibrationStore
-from station.drivers.virtual_scene import default_rig
-from station.errors import BoothError, CalibrationError
+from station.calibration.detect.board import Board
+from station.calibration.guide.calibrate_cli import calibrate
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.errors import BoothError, CalibrationError
+from station.core.rig import Rig
+from station.simulation.scene import default_rig
 
 CAMERAS = default_rig().cameras
 

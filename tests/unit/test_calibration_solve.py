@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import synthetic_calibration as synthetic
 
-from station.calibration import joint
-from station.calibration.detections import BallDetection, Observations
-from station.calibration.rig import Rig
-from station.calibration.sensor_noise import INDEPENDENT_HZ
-from station.calibration.solve import Solution, solve
-from station.calibration.world import relatives, twist_between
-from station.drivers.virtual import SimulatedUnit
-from station.drivers.virtual_calibration import BALL, VirtualProcedure
-from station.errors import CalibrationError
-from station.geometry import invert, transform
+from station.calibration.detect.detections import BallDetection, Observations
+from station.calibration.solve import joint
+from station.calibration.solve.solution import Solution, solve
+from station.calibration.solve.world import relatives, twist_between
+from station.core.errors import CalibrationError
+from station.core.geometry import invert, transform
+from station.core.kinect_v1 import INDEPENDENT_HZ
+from station.core.rig import Rig
+from station.simulation.procedure import BALL, VirtualProcedure
+from station.simulation.sensor import SimulatedUnit
 
 REFERENCE, FRONT = "front-upper", ("front-upper", "front-lower")
 

@@ -9,15 +9,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from station.calibration import finder
-from station.calibration.detections import BallDetection
-from station.calibration.feed import Feed, TimedFrame
-from station.calibration.finder import BallFinder
-from station.calibration.guide import Guide
-from station.calibration.sensor_noise import INDEPENDENT_HZ
-from station.calibration.session import Session
-from station.calibration.steps import wave_ball
-from station.drivers.virtual_scene import default_rig
+from station.calibration.detect.detections import BallDetection
+from station.calibration.guide import finder
+from station.calibration.guide.feed import Feed, TimedFrame
+from station.calibration.guide.finder import BallFinder
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import Session
+from station.calibration.guide.steps import wave_ball
+from station.core.kinect_v1 import INDEPENDENT_HZ
+from station.simulation.scene import default_rig
 
 _CAMERAS = ("front-lower", "front-upper")
 

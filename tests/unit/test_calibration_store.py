@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.calibration.coverage import Coverage
-from station.calibration.detections import BallDetection, PlaneObservation
-from station.calibration.rig import Rig
-from station.calibration.scene import static_view
-from station.calibration.session import EMPTY, JOURNAL, MARK, SENSORS, Lens, Session
-from station.calibration.store import CalibrationStore
-from station.drivers.virtual_scene import default_rig
-from station.errors import CalibrationError, FormatError
+from station.calibration.detect.coverage import Coverage
+from station.calibration.detect.detections import BallDetection, PlaneObservation
+from station.calibration.detect.scene import static_view
+from station.calibration.guide.session import EMPTY, JOURNAL, MARK, SENSORS, Lens, Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.errors import CalibrationError, FormatError
+from station.core.rig import Rig
+from station.simulation.scene import default_rig
 
 CAMERAS = default_rig().cameras
 STARTED = "2026-11-21T10:00:00Z"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from station.calibration.clocks import large_jump
-from station.calibration.pairwise import Track, relate_all
+from station.calibration.solve.clocks import large_jump
+from station.calibration.solve.pairwise import Track, relate_all
 
 
 def track(times_s: np.ndarray, late_s: np.ndarray | float = 0.0) -> Track:

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from station.depth import CameraView, PointCloud
-from station.depth.points import rays
-from station.drivers.virtual_scene import (
+from station.core.geometry import rigid, so3_exp, transform
+from station.core.lens import rays
+from station.simulation.scene import (
     Mesh,
     VirtualScene,
     booth_walls,
@@ -17,13 +17,13 @@ from station.drivers.virtual_scene import (
     rod,
     sphere,
 )
-from station.geometry import rigid, so3_exp, transform
-from workers.scape.cameras import CameraCorrections
-from workers.scape.crown import Reach, reach
-from workers.scape.deformation import vertex_normals
-from workers.scape.model import BodyModel, load_model
-from workers.scape.rims import rims_of
-from workers.scape.surface import fit_surface
+from workers.cloud.observed import CameraView, PointCloud
+from workers.scape.evidence.cameras import CameraCorrections
+from workers.scape.evidence.crown import Reach, reach
+from workers.scape.evidence.rims import rims_of
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.surface.displacement import fit_surface
 
 UPPER = default_rig().cameras["front-upper"]
 POSE = UPPER.world_from_camera

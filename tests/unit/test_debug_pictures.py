@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from workers.debug_pictures import DebugPictures
-from workers.fit_cli import fit
-from workers.render import BACKGROUND
-from workers.scape.deformation import vertex_normals
-from workers.scape.model import BodyModel, load_model
+from workers.pictures.debug_pictures import DebugPictures
+from workers.pictures.render import BACKGROUND
+from workers.reconstruct.fit_cli import fit
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from station.calibration.drift import LEVER_M, DriftReference, estimate_move
-from station.calibration.scene import StaticView, static_view
-from station.drivers.raw11 import DEPTH_SCALE_M, TABLE
-from station.drivers.virtual_noise import TrueView, UnitError, observe
-from station.drivers.virtual_scene import (
+from station.calibration.detect.scene import StaticView, static_view
+from station.calibration.drift.motion import LEVER_M, DriftReference, estimate_move
+from station.core.errors import FormatError
+from station.core.geometry import se3_exp
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.simulation.noise import TrueView, UnitError, observe
+from station.simulation.scene import (
     Mesh,
     VirtualScene,
     booth_walls,
@@ -21,12 +23,10 @@ from station.drivers.virtual_scene import (
     fixed_posts,
     load_mesh,
 )
-from station.errors import FormatError
-from station.geometry import se3_exp
 
 CAMERA = default_rig().cameras["front-lower"]
 ROOM = (*booth_walls(), *fixed_posts())
-BODY = load_mesh(Path(__file__).parents[2] / "station/data/bodies/ben.npz")
+BODY = load_mesh(Path(__file__).parents[2] / "station/simulation/bodies/ben.npz")
 UNIT = UnitError(0.008, (0.2, -0.1))
 Twist = tuple[float, float, float, float, float, float]
 STILL: Twist = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.calibration.feed import RecordedClock, gather_frames, replayed_feed
-from station.config import BoothConfig, CameraConfig
-from station.errors import CalibrationError, FormatError
-from station.messages import FrameHeader
-from station.recording import RecordedFrame, write_recording
+from station.calibration.guide.feed import RecordedClock, gather_frames, replayed_feed
+from station.core.config import BoothConfig, CameraConfig
+from station.core.errors import CalibrationError, FormatError
+from station.messaging.messages import FrameHeader
+from station.sensors.recording import RecordedFrame, write_recording
 
 _HZ = 60_000_000
 _FIRST_TICK = 2**32 - 4 * 2_000_000
@@ -97,9 +97,9 @@ def test_a_missing_recording_is_named(tmp_path: Path) -> None:
 
 
 def test_a_station_that_does_not_run_is_said(tmp_path: Path) -> None:
-    from station.calibration.feed import live_feed
-    from station.config import RuntimeConfig
-    from station.errors import BoothError
+    from station.calibration.guide.feed import live_feed
+    from station.core.config import RuntimeConfig
+    from station.core.errors import BoothError
 
     config = _config("front").model_copy(
         update={"runtime": RuntimeConfig(folder=tmp_path, command_timeout_s=0.3)}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from station import files
-from station.errors import BundleError, FormatError
+from station.core import files
+from station.core.errors import BundleError, FormatError
 
 
 def test_json_round_trip(tmp_path: Path) -> None:

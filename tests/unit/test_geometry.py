@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station import geometry
+from station.core import geometry
 
 _components = st.floats(-1.0, 1.0, allow_nan=False)
 _vectors = st.tuples(_components, _components, _components).map(np.array)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workers.scape.correspondence import OrientedTree
-from workers.scape.deformation import vertex_normals
-from workers.scape.hands import hands_of, place_hands
-from workers.scape.model import BodyModel, BodyState, load_model
+from workers.scape.evidence.correspondence import OrientedTree
+from workers.scape.fit.hands import hands_of, place_hands
+from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.deformation import vertex_normals
 
 
 @pytest.fixture(scope="module")

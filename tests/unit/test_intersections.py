@@ -8,10 +8,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from workers.scape.crossings import crossing_pairs
-from workers.scape.deformation import triangle_areas, vertex_normals
-from workers.scape.intersections import self_intersections, turned_over, untangled
-from workers.scape.model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.deformation import triangle_areas, vertex_normals
+from workers.scape.surface.crossings import crossing_pairs
+from workers.scape.surface.intersections import self_intersections, turned_over, untangled
 
 
 @pytest.fixture(scope="module")

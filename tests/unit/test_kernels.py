@@ -9,13 +9,19 @@ import pytest
 import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
-from station.drivers.virtual_scene import sphere
-from workers.scape.correspondence import Followers, OrientedTree
-from workers.scape.deformation import EdgeSolver, area_vectors, edges, neighbours, vertex_normals
-from workers.scape.initial import posed, starting_states
-from workers.scape.kernels import conjugate_gradients, follow, trimmed_costs
-from workers.scape.model import BodyModel, load_model
-from workers.scape.sampled import SampledBody
+from station.simulation.scene import sphere
+from workers.scape.evidence.correspondence import Followers, OrientedTree
+from workers.scape.fit.initial import posed, starting_states
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import (
+    EdgeSolver,
+    area_vectors,
+    edges,
+    neighbours,
+    vertex_normals,
+)
+from workers.scape.model.kernels import conjugate_gradients, follow, trimmed_costs
+from workers.scape.model.sampled import SampledBody
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
 BALL = sphere((0.1, 0.2, 1.0), 0.3)

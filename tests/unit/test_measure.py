@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from station.errors import InputError
-from station.geometry import so3_exp
+from station.core.errors import InputError
+from station.core.geometry import so3_exp
 from workers.export.meshes import obj_mesh, ply_mesh
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
-from workers.measure.cli import measure
 from workers.measure.definitions import DEFINITIONS, Route, Section
 from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
 from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
-from workers.scape.landmarks import find_landmarks
-from workers.scape.model import BodyModel, BodyState, load_model
+from workers.reconstruct.measure_cli import measure
+from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.model.body_model import BodyModel, BodyState, load_model
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,15 @@
 import msgpack
 import pytest
 
-from station.errors import FormatError
-from station.messages import CameraHealth, DesiredState, Reply, Request, ScanEvent, SensorInfo
+from station.core.errors import FormatError
+from station.messaging.messages import (
+    CameraHealth,
+    DesiredState,
+    Reply,
+    Request,
+    ScanEvent,
+    SensorInfo,
+)
 
 _EXAMPLES = [
     CameraHealth("front", "lost", "unplugged", 10, 1, 0),

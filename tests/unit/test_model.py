@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.errors import FormatError
-from station.geometry import so3_exp
-from workers.scape.model import SHIPPED, BodyModel, BodyState, load_model, save_model
-from workers.scape.sampled import SampledBody
+from station.core.errors import FormatError
+from station.core.geometry import so3_exp
+from workers.scape.model.body_model import SHIPPED, BodyModel, BodyState, load_model, save_model
+from workers.scape.model.sampled import SampledBody
 
 
 @pytest.fixture(scope="module")

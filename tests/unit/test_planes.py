@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from station.calibration.planes import observe_floor, observe_wall
-from station.calibration.problem import Surface
-from station.drivers.virtual_scene import (
+from station.calibration.detect.planes import observe_floor, observe_wall
+from station.calibration.solve.problem import Surface
+from station.core.geometry import invert
+from station.simulation.scene import (
     Mesh,
     VirtualScene,
     booth_walls,
@@ -12,7 +13,6 @@ from station.drivers.virtual_scene import (
     default_rig,
     uneven,
 )
-from station.geometry import invert
 
 CAMERA = default_rig().cameras["front-lower"]
 SCALE_M = 5e-5

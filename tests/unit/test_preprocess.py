@@ -9,18 +9,19 @@ import numba
 import numpy as np
 import pytest
 
-from station.bundle import read_bundle
-from station.calibration.rig import CameraCalibration
-from station.calibration.sensor_noise import RANDOM_SIGMA, STEP
-from station.depth import Volume, preprocess
-from station.depth.average import average
-from station.depth.people import count_people
-from station.depth.points import normals, project, rays, within
-from station.drivers.virtual import SimulatedBooth, render_bundle
-from station.drivers.virtual_scene import Mesh, chair, default_rig, load_mesh
-from station.errors import InputError
+from station.core.bundle import read_bundle
+from station.core.errors import InputError
+from station.core.kinect_v1 import RANDOM_SIGMA, STEP
+from station.core.lens import project, rays
+from station.core.rig import CameraCalibration
+from station.simulation.scene import Mesh, chair, default_rig, load_mesh
+from station.simulation.sensor import SimulatedBooth, render_bundle
+from workers.cloud.average import average
+from workers.cloud.people import count_people
+from workers.cloud.points import normals, within
+from workers.cloud.preprocess import Volume, preprocess
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 def test_the_mean_leaves_out_what_flies() -> None:
@@ -90,7 +91,7 @@ def test_the_volume_is_a_box_of_the_world() -> None:
 
 def test_warming_up_compiles_what_a_scan_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     """A read-only array is another type to the compiler than the same that can be written to."""
-    module = import_module("station.depth.preprocess")
+    module = import_module("workers.cloud.preprocess")
     called: list[tuple[numba.types.Type, ...]] = []
 
     def watched(*arguments: np.ndarray) -> np.ndarray:

@@ -4,13 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.scape.model import BodyModel, BodyState, load_model
-from workers.scape.projection import PROJECTION_STRIDE, best_fit
-from workers.scape.registration import distances, register
-from workers.scape.sampled import SampledBody
-from workers.scape.sampling import Sampling
+from workers.scape.fit.sampling import Sampling
+from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.learn.registration import distances, register
+from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.sampled import SampledBody
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 @pytest.fixture(scope="module")

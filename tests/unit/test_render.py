@@ -9,12 +9,12 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from station.geometry import so3_exp
+from station.core.geometry import so3_exp
 from workers.export.preview import _spread, preview
 from workers.measure.body import Measurement, measure_body
-from workers.render import BACKGROUND, Frame, Scene
-from workers.scape.model import BodyModel, load_model
-from workers.scape.verdict import Verdict
+from workers.pictures.render import BACKGROUND, Frame, Scene
+from workers.scape.fit.verdict import Verdict
+from workers.scape.model.body_model import BodyModel, load_model
 
 OK = Verdict("ok", ())
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from station.calibration.rig import CameraCalibration, DepthCorrection, Rig
-from station.errors import CalibrationError, FormatError
-from station.geometry import se3_exp
+from station.core.errors import CalibrationError, FormatError
+from station.core.geometry import se3_exp
+from station.core.rig import CameraCalibration, DepthCorrection, Rig
 
 
 def make_rig() -> Rig:

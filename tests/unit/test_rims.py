@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from station.depth import CameraView, PointCloud
-from station.depth.points import project
-from station.drivers.virtual_scene import default_rig
-from station.geometry import invert, transform
-from workers.scape.rims import rims_of
+from station.core.geometry import invert, transform
+from station.core.lens import project
+from station.simulation.scene import default_rig
+from workers.cloud.observed import CameraView, PointCloud
+from workers.scape.evidence.rims import rims_of
 
 FINGER_M, WALL_M = 1.6, 3.0
 ROWS, COLUMNS = slice(200, 240), slice(318, 323)

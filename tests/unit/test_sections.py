@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from station.drivers.virtual_scene import sphere
+from station.simulation.scene import sphere
 from workers.measure.sections import (
     EdgeNet,
     EdgePoints,
@@ -11,7 +11,7 @@ from workers.measure.sections import (
     plane_axes,
     surface_order,
 )
-from workers.scape.deformation import signed_volume
+from workers.scape.model.deformation import signed_volume
 
 TILTED = np.array([0.6, 0.0, 0.8])
 UP = np.array([0.0, 0.0, 1.0])

@@ -1,9 +1,9 @@
 import numpy as np
 
-from workers.scape.crossings import crossing_pairs
-from workers.scape.deformation import signed_volume
-from workers.scape.model import load_model
-from workers.scape.skin import outer_skin, separated
+from workers.scape.learn.skin import outer_skin, separated
+from workers.scape.model.body_model import load_model
+from workers.scape.model.deformation import signed_volume
+from workers.scape.surface.crossings import crossing_pairs
 
 
 def _turned(profile: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:

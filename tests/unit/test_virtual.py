@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import synthetic_calibration as synthetic
 
-from station.config import CameraConfig
-from station.drivers.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
-from station.drivers.registry import make_driver
-from station.drivers.virtual import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
-from station.drivers.virtual_noise import UnitError, axial_sigma_m, raw_from_depth
-from station.drivers.virtual_scene import (
+from station.core.config import CameraConfig
+from station.core.errors import DriverError, FormatError, InputError
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
+from station.sensors.recording import check_recording, read_raw, write_recording
+from station.sensors.registry import make_driver
+from station.simulation.noise import UnitError, axial_sigma_m, raw_from_depth
+from station.simulation.scene import (
     VirtualScene,
     box,
     default_rig,
@@ -19,10 +20,9 @@ from station.drivers.virtual_scene import (
     sphere,
     uneven,
 )
-from station.errors import DriverError, FormatError, InputError
-from station.recording import check_recording, read_raw, write_recording
+from station.simulation.sensor import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
 
-BODIES = Path(__file__).parents[2] / "station/data/bodies"
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
 def test_raw_values_and_depths_are_inverse() -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.calibration.scene import static_view
-from station.calibration.session import Session
-from station.calibration.store import CalibrationStore
-from station.calibration.watch import DriftWatch
-from station.drivers.virtual_scene import default_rig
-from station.errors import CalibrationError
+from station.calibration.detect.scene import static_view
+from station.calibration.drift.watch import DriftWatch
+from station.calibration.guide.session import Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.errors import CalibrationError
+from station.simulation.scene import default_rig
 
 CAMERA = default_rig().cameras["front-lower"]
 

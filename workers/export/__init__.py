@@ -1,1 +1,3 @@
-"""Files that a fitting room opens: meshes, pictures, tables."""
+"""The files of a result: meshes, pictures, tables.
+The numbers in them are computed elsewhere.
+"""

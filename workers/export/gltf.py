@@ -12,9 +12,9 @@ import pygltflib as gltf
 from numpy.typing import NDArray
 
 from workers.measure.body import Measurement
-from workers.scape.deformation import Faces, vertex_normals
-from workers.scape.model import BodyModel, BodyState
-from workers.scape.skeleton import joint_positions
+from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.deformation import Faces, vertex_normals
+from workers.scape.model.skeleton import joint_positions
 
 Array = NDArray[np.float64]
 

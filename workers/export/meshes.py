@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.deformation import Faces, vertex_normals
-from workers.scape.model import BodyModel
+from workers.scape.model.body_model import BodyModel
+from workers.scape.model.deformation import Faces, vertex_normals
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from station.geometry import so3_exp
+from station.core.geometry import so3_exp
 from workers.measure.body import Measurement
-from workers.render import (
+from workers.pictures.render import (
     BACKGROUND,
     Color,
     Frame,
@@ -24,7 +24,7 @@ from workers.render import (
     text_width,
     write_text,
 )
-from workers.scape.verdict import Verdict
+from workers.scape.fit.verdict import Verdict
 
 Array = NDArray[np.float64]
 

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from station import __version__
-from station.depth import PointCloud
+from workers.cloud.observed import PointCloud
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.preview import preview
+from workers.export.stopwatch import Stopwatch
 from workers.measure.body import Content, MeasuredBody
-from workers.scape.fit import FitResult
-from workers.scape.model import BodyModel
-from workers.stopwatch import Stopwatch
+from workers.scape.fit.fit import FitResult
+from workers.scape.model.body_model import BodyModel
 
 STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "open3d-cpu", "opencv-contrib-python-headless", "cholespy")

@@ -1,1 +1,3 @@
-"""Tailor's measurements: landmarks, girths, lengths and the table that defines them."""
+"""Tailor's measurements: the table that defines them, their lines, values and intervals.
+Fitting belongs to `workers.scape`, writing tables to `workers.export`.
+"""

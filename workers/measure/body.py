@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from workers.measure.intervals import Pose, content_interval, intervals, row_values
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import trace_all
-from workers.scape.deformation import signed_volume, triangle_areas
-from workers.scape.model import BodyModel, BodyState
+from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.deformation import signed_volume, triangle_areas
 
 Array = NDArray[np.float64]
 

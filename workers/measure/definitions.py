@@ -1,6 +1,6 @@
 """The table of measurements: what each one is, in words and for the program.
 
-Landmarks are vertices of the template (workers.scape.landmarks), parts are its parts, so a
+Landmarks are vertices of the template (workers.scape.learn.landmarks), parts are its parts, so a
 definition is made once and every fit carries it. Clauses are given where public sources name
 them: ISO 8559-1:2017 for clothing, ISO 7250-1:2017 for the body; a row that follows a standard
 whose clause number could not be confirmed names the standard alone, any other row names none.

@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from station.errors import FormatError
+from station.core.errors import FormatError
 from workers.measure.tracing import Trace
 
 Array = NDArray[np.float64]

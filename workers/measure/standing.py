@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from station.geometry import so3_exp
-from workers.scape.model import BodyModel, BodyState
+from station.core.geometry import so3_exp
+from workers.scape.model.body_model import BodyModel, BodyState
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from station.errors import InputError
+from station.core.errors import InputError
 from workers.measure.definitions import (
     DEFINITIONS,
     Definition,
@@ -29,8 +29,8 @@ from workers.measure.sections import (
     plane_axes,
     surface_order,
 )
-from workers.scape.deformation import vertex_normals
-from workers.scape.model import BodyModel
+from workers.scape.model.body_model import BodyModel
+from workers.scape.model.deformation import vertex_normals
 
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])

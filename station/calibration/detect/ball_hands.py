@@ -1,0 +1,95 @@
+"""Which pixels of a ball are not the ball's alone: hands and fingers hold it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.detect.ball_image import INCIDENCE_COSINE, ball_image
+from station.core.kinect_v1 import RANDOM_SIGMA
+from station.core.rig import CameraCalibration
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_STRAY_BLUR_PX = 7
+_STRAY_NOISE = 0.7
+"""Share of a pixel's noise that is left in the mean over the blur."""
+_STRAY_SIGMAS = 3.0
+_STRAY_CLIP = 12.0
+_STRAY_COSINE = 0.4
+_RING = (1.1, 1.25)
+"""Of the radius: outside the flickering silhouette, where one sees what holds the ball."""
+_FINGERS_M = 0.055
+"""How far fingers of 8 cm, bent round a ball, are seen to reach from the hand."""
+_FINGERS_SHOW_M = 1.7
+"""Up to here a finger is as wide as the mean that shows strays, and stands out by its limit."""
+
+
+def hands(
+    part: Image,
+    camera: CameraCalibration,
+    ray: Image,
+    center: Array,
+    radius: float,
+    radius_m: float,
+    gate: float,
+) -> Mask:
+    """Pixels (h, w) that are not to speak for a ball, as fitted with a radius of its own.
+
+    ``radius_m`` is the ball's true radius, ``gate`` what a pixel's noise may be, 1/m. Fingers on a
+    distant ball are too narrow to be told from noise and once pulled its centre towards the hand by
+    0.7 mm, in frame after frame: there all is left out that a hand beside it may reach.
+    """
+    off = _strays(part, ray, center, radius)
+    if center[2] > _FINGERS_SHOW_M:
+        off |= _held(part, camera, ray, center, radius_m, gate)
+    return off
+
+
+def _strays(part: Image, ray: Image, center: Array, radius: float) -> Mask:
+    """Pixels near areas that do not lie on the ball: what touches or covers it.
+
+    A finger stands out of the ball by no more than a few pixels' noise; the mean over its width
+    tells it apart. Areas off to either side are left out alike, so that noise cannot pull.
+    """
+    expected, cosine = ball_image(ray, center, radius)
+    seen = (cosine > _STRAY_COSINE) & (part > 0.0)
+    away = np.where(seen, part - expected, 0.0).astype(np.float32)
+    away = np.clip(away, -_STRAY_CLIP * RANDOM_SIGMA, _STRAY_CLIP * RANDOM_SIGMA)
+    size = (_STRAY_BLUR_PX, _STRAY_BLUR_PX)
+    share = cv2.blur(seen.astype(np.float32), size)
+    mean = cv2.blur(away, size) / np.maximum(share, 0.2)
+    limit = _STRAY_SIGMAS * _STRAY_NOISE * RANDOM_SIGMA / np.sqrt(np.maximum(cosine, 0.2))
+    off = seen & (np.abs(mean) > limit)
+    return np.asarray(cv2.dilate(off.astype(np.uint8), np.ones(size, np.uint8)) > 0)
+
+
+def _held(
+    part: Image, camera: CameraCalibration, ray: Image, center: Array, radius: float, gate: float
+) -> Mask:
+    """Pixels within fingers' reach of what stands before the ball, or beside it no farther than
+    its rim."""
+    expected, cosine = ball_image(ray, center, radius)
+    before = (cosine > INCIDENCE_COSINE) & (part > expected + gate)
+    ring, beyond = surroundings(part, ray, center, radius)
+    hand = _solid(before) | (_solid(~beyond) & ring)
+    reach_px = _FINGERS_M * camera.K[0, 0] / center[2]
+    apart_px = cv2.distanceTransform((~hand).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(apart_px < reach_px)
+
+
+def _solid(mask: Mask) -> Mask:
+    """Without specks of noise."""
+    window = np.ones((3, 3), np.uint8)
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, window) > 0)
+
+
+def surroundings(part: Image, ray: Image, center: Array, radius: float) -> tuple[Mask, Mask]:
+    """The ring around the ball, and where one sees past its rim (or nothing)."""
+    along = ray @ center
+    away2 = center @ center - along**2 / np.einsum("hwi,hwi->hw", ray, ray)
+    ring = (away2 > (_RING[0] * radius) ** 2) & (away2 < (_RING[1] * radius) ** 2)
+    return ring, part < 1.0 / (center[2] + 0.3 * radius)

@@ -1,0 +1,177 @@
+"""What the cameras saw during a calibration: balls and flat surfaces, reduced to patches.
+
+A patch is the mean of a few dozen neighbouring pixels: (u, v, inverse depth, variance). It keeps
+what the images say about places *and* about the cameras' depth errors, so that the joint solution
+may still change the depth correction, at a thousandth of the images' size. Everything is in inverse
+depth (1/m): there a Kinect's noise and quantisation are the same at every range, a depth correction
+acts linearly, and a flat surface is linear in the pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.errors import FormatError
+from station.core.rig import CameraCalibration, DepthCorrection
+from station.sensors.base import DeviceInfo
+
+Array = NDArray[np.float64]
+
+FLOOR = "floor"
+
+
+def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:
+    """A camera as it comes from the factory: its lens is known, its place is not."""
+    return CameraCalibration(
+        name=name,
+        serial=info.serial,
+        model=info.model,
+        width=info.width,
+        height=info.height,
+        K=np.asarray(info.K, np.float64),
+        distortion=np.asarray(info.distortion, np.float64),
+        depth_correction=DepthCorrection(),
+        world_from_camera=np.eye(4),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BallDetection:
+    """The ball in one depth image, before any depth correction."""
+
+    camera: str
+    time_s: float
+    """Host's monotonic clock, by the clock model."""
+    center_m: Array
+    """(3,) camera frame; of a ball of the radius that was given."""
+    covariance_m2: Array
+    """(3, 3) of the centre under the sensor's noise."""
+    points: int
+    """Pixels on the ball that were used."""
+    radius_m: float
+    """As measured: what the radius would be if it were not known."""
+    radius_sigma_m: float
+    patches: Array
+    """(k, 4): u, v (pixels), inverse depth (1/m), its variance (1/m2)."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "camera": self.camera,
+            "time_s": self.time_s,
+            "center_m": self.center_m.tolist(),
+            "covariance_m2": self.covariance_m2.tolist(),
+            "points": self.points,
+            "radius_m": self.radius_m,
+            "radius_sigma_m": self.radius_sigma_m,
+            "patches": _rounded(self.patches),
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
+        """The detection of its JSON.
+
+        Raises:
+            FormatError: a field is missing or is not what it should be.
+        """
+        try:
+            return cls(
+                camera=str(document["camera"]),
+                time_s=float(document["time_s"]),
+                center_m=_numbers(document["center_m"], (3,)),
+                covariance_m2=_numbers(document["covariance_m2"], (3, 3)),
+                points=int(document["points"]),
+                radius_m=float(document["radius_m"]),
+                radius_sigma_m=float(document["radius_sigma_m"]),
+                patches=_numbers(document["patches"], (None, 4)),
+            )
+        except (KeyError, TypeError, ValueError) as cause:
+            raise FormatError(f"a ball detection cannot be read ({cause})") from None
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneObservation:
+    """A flat surface in one camera's (averaged) depth image, before any depth correction."""
+
+    camera: str
+    surface: str
+    """FLOOR, or the wall's name; a board that is moved is another wall at each place."""
+    points: int
+    patches: Array
+    """(k, 4): u, v (pixels), inverse depth (1/m), its variance (1/m2)."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "camera": self.camera,
+            "surface": self.surface,
+            "points": self.points,
+            "patches": _rounded(self.patches),
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
+        """The observation of its JSON.
+
+        Raises:
+            FormatError: a field is missing or is not what it should be.
+        """
+        try:
+            return cls(
+                camera=str(document["camera"]),
+                surface=str(document["surface"]),
+                points=int(document["points"]),
+                patches=_numbers(document["patches"], (None, 4)),
+            )
+        except (KeyError, TypeError, ValueError) as cause:
+            raise FormatError(f"a seen surface cannot be read ({cause})") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """All that a calibration is solved from."""
+
+    balls: Sequence[BallDetection]
+    """Of the ball on its way through the booth, any order."""
+    mark: Sequence[BallDetection] = field(default_factory=tuple)
+    """Of the ball resting on the mark."""
+    front: Sequence[BallDetection] = field(default_factory=tuple)
+    """Of the ball resting on the floor in front of the mark; gives the heading when there."""
+    planes: Sequence[PlaneObservation] = field(default_factory=tuple)
+    around: Mapping[str, Sequence[BallDetection]] = field(default_factory=dict)
+    """Of the ball resting on the floor elsewhere: name of the place -> detections."""
+
+    @classmethod
+    def merged(cls, parts: Iterable[Self]) -> Self:
+        """What several cameras saw of one calibration."""
+        listed = list(parts)
+        places = dict.fromkeys(place for part in listed for place in part.around)
+        return cls(
+            balls=[one for part in listed for one in part.balls],
+            mark=[one for part in listed for one in part.mark],
+            front=[one for part in listed for one in part.front],
+            planes=[one for part in listed for one in part.planes],
+            around={
+                place: [one for part in listed for one in part.around.get(place, ())]
+                for place in places
+            },
+        )
+
+
+def _rounded(patches: Array) -> list[list[float]]:
+    """Seven digits, far finer than a reading."""
+    return [[float(f"{x:.7g}") for x in patch] for patch in patches.tolist()]
+
+
+def _numbers(values: Any, shape: tuple[int | None, ...]) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != len(shape) or any(
+        want not in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    ):
+        raise ValueError(f"{shape} numbers were expected, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError("it holds numbers that are not finite")
+    return array

@@ -1,0 +1,134 @@
+"""What a camera sees of the empty booth: the floor and whatever always stands there.
+
+Kept with each calibration. The drift check compares later frames with it, and the ball is looked
+for in front of it. Everything is in inverse depth, in which a structured-light sensor's noise is
+the same near and far; 0 stands for no reading, so that an edge against nothing is an edge too.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.errors import FormatError
+from station.core.files import write_bytes
+
+Image = NDArray[np.float32]
+
+VERSION = 1
+SMOOTHING_PX = 3.0
+"""The noise is measured, and edges are compared, after a Gaussian of this width."""
+_MOSTLY = 0.5
+_LEAST_SHARE = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class StaticView:
+    """One camera's empty booth, (h, w) each."""
+
+    inverse_depth: Image
+    """Mean over the frames of 1/z as measured (uncorrected), 1/m; no reading counts as 0."""
+    share: Image
+    """Share of the frames that have a reading."""
+    noise: Image
+    """Standard deviation over time of one frame's smoothed surface (see ``smoothed``), 1/m."""
+    outline_noise: Image
+    """The same of its inverse depth with 0 for no reading, as outlines are compared."""
+    frames: int
+
+    def depth_m(self) -> Image:
+        """Mean depth in metres where most frames have a reading, else 0."""
+        often = self.share > _MOSTLY
+        safe = np.where(often, self.inverse_depth, 1.0)
+        return np.where(often, self.share / safe, 0.0).astype(np.float32)
+
+    def save(self, path: Path) -> None:
+        """Write the view durably, about 1 MB."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            version=np.array(VERSION),
+            inverse_depth=self.inverse_depth,
+            readings=np.rint(self.frames * self.share).astype(np.uint16),
+            noise=self.noise.astype(np.float16),
+            outline_noise=self.outline_noise.astype(np.float16),
+            frames=np.array(self.frames),
+        )
+        write_bytes(path, buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> StaticView:
+        """Read a stored view.
+
+        Raises:
+            FormatError: naming the file that is missing, torn or of another version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                version = int(archive["version"])
+                if version != VERSION:
+                    raise FormatError(
+                        f"{path} has version {version}; this program reads {VERSION}; "
+                        "run station calibrate floor"
+                    )
+                frames = int(archive["frames"])
+                return cls(
+                    inverse_depth=archive["inverse_depth"],
+                    share=archive["readings"].astype(np.float32) / np.float32(frames),
+                    noise=archive["noise"].astype(np.float32),
+                    outline_noise=archive["outline_noise"].astype(np.float32),
+                    frames=frames,
+                )
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as cause:
+            raise FormatError(
+                f"{path} cannot be read ({cause}); run station calibrate floor"
+            ) from None
+
+
+def inverse_depth(depth: NDArray[np.uint16], scale_m: float) -> Image:
+    """1/z in 1/m of a depth frame in units of scale_m; 0 stays 0."""
+    metres = depth.astype(np.float32) * np.float32(scale_m)
+    return np.divide(1.0, metres, out=np.zeros_like(metres), where=metres > 0)
+
+
+def smoothed(inverse: Image, share: Image) -> tuple[Image, Image]:
+    """Smoothed images: of the surface, over its readings alone, and with 0 for no reading."""
+    with_gaps = np.asarray(cv2.GaussianBlur(inverse, (0, 0), SMOOTHING_PX), np.float32)
+    there = cv2.GaussianBlur(share, (0, 0), SMOOTHING_PX)
+    return np.asarray(with_gaps / np.maximum(there, _LEAST_SHARE), np.float32), with_gaps
+
+
+def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticView:
+    """Gather frames (h, w) of a booth in which nothing moves.
+
+    Raises:
+        ValueError: fewer than two frames; a noise cannot be told from one.
+    """
+    count = 0
+    for frame in frames:
+        inverse = inverse_depth(frame, scale_m)
+        there = (inverse > 0).astype(np.float32)
+        images = np.stack(smoothed(inverse, there))
+        if not count:
+            first = images
+            total, seen = np.zeros_like(inverse), np.zeros_like(inverse)
+            level, spread = np.zeros_like(images), np.zeros_like(images)
+        total += inverse
+        seen += there
+        # About the first frame, so that squares of small differences do not drown in float32.
+        level += images - first
+        spread += np.square(images - first)
+        count += 1
+    if count < 2:
+        raise ValueError("a static view needs at least two frames")
+    variance = (spread - np.square(level) / count) / (count - 1)
+    noise, outline_noise = np.sqrt(np.maximum(variance, 0.0))
+    n = np.float32(count)
+    return StaticView(total / n, seen / n, noise, outline_noise, count)

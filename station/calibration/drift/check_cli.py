@@ -1,0 +1,106 @@
+"""`station check`: does every camera still stand where it was calibrated? Before a shift."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+
+from station.calibration.drift.motion import CameraMove, DriftReference, estimate_move
+from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import find_config, load_config
+from station.core.errors import CalibrationError
+from station.core.rig import Rig
+
+_FRAMES = 30
+_SENSORS_S = 20.0
+_EXIT_MOVED = 3
+_SAME_SHARE = 0.97
+"""An unchanged booth shows all of the stored background, a person hides a third of it."""
+
+
+@click.command()
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option(
+    "--recordings",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="replay DIR/<camera> instead of the live cameras",
+)
+@click.option("--json", "as_json", is_flag=True, help="for programs")
+def check(config_path: Path | None, recordings: Path | None, as_json: bool) -> None:
+    """Compare the empty booth with what was stored when it was calibrated.
+
+    Exit code 0: every camera stands where it did; 3: one has moved, calibrate again.
+
+    \b
+    Examples:
+      station check
+      station check --json
+    """
+    config = load_config(find_config(config_path))
+    rig = Rig.load(config.calibration)
+    scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
+    missing = [camera.name for camera in config.cameras if camera.name not in scene]
+    if missing:
+        raise CalibrationError(
+            f"the calibration in use ({config.calibration}) has no picture of the empty booth by "
+            f"camera {', '.join(missing)}; calibrate with station calibrate"
+        )
+    source = replayed_feed(config, recordings) if recordings else live_feed(config)
+    with source as feed:
+        taken = _look(feed, list(scene), quiet=as_json)
+    moves = [
+        estimate_move(
+            DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),
+            [frame.depth for frame in frames],
+            frames[0].scale_m,
+        )
+        for name, frames in taken.items()
+    ]
+    if as_json:
+        click.echo(json.dumps([_document(move) for move in moves]))
+    else:
+        for move in moves:
+            click.echo(move.words())
+            if not move.lost and move.unseen():
+                click.echo(
+                    f"  this booth shows it no small move {', '.join(move.unseen_words())}: "
+                    "a fixed post or corner in its view would"
+                )
+    changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
+    if changed and not as_json:
+        most = min(changed, key=lambda move: move.share)
+        percent = 100.0 * (1.0 - most.share)
+        click.echo(
+            f"the booth does not look as it did when it was calibrated ({percent:.0f} % of what "
+            f"camera {most.camera} sees differs): take out whoever and whatever was not "
+            "there, put back what is missing, and small moves are noticed better"
+        )
+    if any(move.moved or move.lost for move in moves):
+        sys.exit(_EXIT_MOVED)
+
+
+def _look(feed: Feed, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:
+    feed.cameras(_SENSORS_S)
+    guide = Guide(attended=False, countdown_s=0.0)
+    taken = gather_frames(feed, names, _FRAMES, (lambda _: None) if quiet else guide.progress)
+    guide.end_line()
+    return taken
+
+
+def _document(move: CameraMove) -> dict[str, object]:
+    return {
+        "camera": move.camera,
+        "moved": move.moved,
+        "lost": move.lost,
+        "rotation_rad": move.xi[:3].tolist(),
+        "translation_m": move.xi[3:].tolist(),
+        "sigma": np.sqrt(np.diag(move.covariance)).tolist(),
+        "background_share": move.share,
+        "unseen": move.unseen_words(),
+    }

@@ -1,0 +1,58 @@
+"""Every scan checks the cameras: its background against what was stored at the calibration."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.detect.scene import StaticView
+from station.calibration.drift.motion import CameraMove, DriftReference, estimate_move
+from station.calibration.guide.store import CalibrationStore
+from station.core.errors import BoothError, CalibrationError
+from station.core.rig import CameraCalibration
+
+
+class DriftWatch:
+    """Knows the empty booth of the calibration in use, and follows when another is put into use."""
+
+    def __init__(self, store: CalibrationStore, log: logging.Logger) -> None:
+        self._store, self._log = store, log
+        self._content = b""
+        self._views: Mapping[str, StaticView] = {}
+        self._references: dict[str, DriftReference] = {}
+
+    def moves(
+        self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
+    ) -> list[CameraMove]:
+        """How far a camera stands off, by frames of one moment; none where nothing was stored.
+
+        Raises:
+            CalibrationError: the camera's images are of another size than when it was calibrated.
+        """
+        self._follow()
+        view = self._views.get(camera.name)
+        if view is None:
+            return []
+        if frames[0].shape != view.inverse_depth.shape:
+            height, width = frames[0].shape
+            raise CalibrationError(
+                f"camera {camera.name} gives images of {width} x {height}, not those that it was "
+                "calibrated with; run station calibrate"
+            )
+        if camera.name not in self._references:
+            self._references[camera.name] = DriftReference.prepare(camera, view)
+        return [estimate_move(self._references[camera.name], frames, scale_m)]
+
+    def _follow(self) -> None:
+        try:
+            content = self._store.in_use.read_bytes()
+            if content == self._content:
+                return
+            self._references, self._views = {}, {}
+            self._views = self._store.scene()
+            self._content = content
+        except (BoothError, OSError) as error:
+            self._log.warning("scans are not checked for moved cameras: %s", error)

@@ -1,0 +1,264 @@
+"""`station calibrate`: from an empty booth and a waved ball to a dated calibration in use."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+import numpy as np
+
+from station.calibration.detect.board import Board, BoardView, check_ties, find_board, judge_lens
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.procedure import Procedure
+from station.calibration.guide.session import FRONT, MARK, Lens, Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import find_config, load_config
+from station.core.errors import CalibrationError
+from station.core.rig import Rig
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
+
+
+def _options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that all steps share; the command gets the procedure."""
+
+    @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+    @click.option(
+        "--recordings",
+        type=click.Path(path_type=Path, exists=True, file_okay=False),
+        help="replay DIR/<step>/<camera> instead of the live cameras",
+    )
+    @click.option("--yes", is_flag=True, help="wait for nobody: no questions, no countdown")
+    @functools.wraps(command)
+    def wrapped(
+        *args: Any, config_path: Path | None, recordings: Path | None, yes: bool, **kwargs: Any
+    ) -> Any:
+        context = click.get_current_context()
+        if context.invoked_subcommand is not None:
+            if any([config_path, recordings, yes, *kwargs.values()]):
+                step = context.invoked_subcommand
+                raise click.UsageError(f"put options after the step: station calibrate {step} ...")
+            return None
+        config = load_config(find_config(config_path))
+        store = CalibrationStore(config.calibrate.folder, config.calibration)
+        attended = not yes and recordings is None
+        guide = Guide(attended, config.calibrate.countdown_s)
+        procedure = Procedure(config, store, recordings, guide)
+        if kwargs.get("list_them"):
+            return command(procedure, *args, **kwargs)
+        with store.locked():
+            return command(procedure, *args, **kwargs)
+
+    return wrapped
+
+
+@click.group(invoke_without_command=True)
+@click.option("--use", "use_name", metavar="DATE", help="put a stored calibration into use")
+@click.option("--list", "list_them", is_flag=True, help="show the stored calibrations")
+@click.option("--new", is_flag=True, help="begin anew; what was seen so far is set aside")
+@_options
+def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: bool) -> None:
+    """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
+
+    Without a step all of them are done, guided, from where the last attempt ended. Every result is
+    a dated folder; the previous ones are kept.
+
+    \b
+    Examples:
+      station calibrate                       guided, all steps
+      station calibrate ball                  wave the ball a little longer
+      station calibrate solve                 solve again from what was seen
+      station calibrate --list
+      station calibrate --use 20261121T100000Z
+    """
+    if list_them:
+        _list(procedure)
+    elif use_name:
+        entry = procedure.store.use(use_name)
+        click.echo(f"calibration {entry.name} is in use: {procedure.store.in_use}")
+    else:
+        if new and (aside := procedure.store.set_aside()):
+            click.echo(f"what was seen so far is kept in {aside}")
+        procedure.run()
+
+
+def _list(procedure: Procedure) -> None:
+    entries, session = list(procedure.store.entries()), procedure.begun()
+    if not entries and session is None:
+        click.echo("no calibration yet; station calibrate makes one")
+    for entry in entries:
+        mark = "*" if entry.in_use else " "
+        click.echo(
+            f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
+            f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms"
+        )
+    if session is not None:
+        click.echo(f"  unfinished, begun {session.started}: {session.summary()}")
+
+
+@calibrate.command("floor")
+@_options
+def floor(procedure: Procedure) -> None:
+    """Look at the empty booth: its floor, and what always stands there.
+
+    \b
+    Examples:
+      station calibrate floor
+    """
+    procedure.empty()
+
+
+@calibrate.command("ball")
+@click.option("--again", is_flag=True, help="forget what was seen of the ball before")
+@_options
+def ball(procedure: Procedure, again: bool) -> None:
+    """Wave the ball; what is seen is added to what was seen before.
+
+    \b
+    Examples:
+      station calibrate ball
+      station calibrate ball --again
+    """
+    if again:
+        procedure.session().forget_balls()
+    procedure.ball()
+
+
+@calibrate.command("mark")
+@click.option("--front", is_flag=True, help="in front of the mark: says where the person faces")
+@_options
+def mark(procedure: Procedure, front: bool) -> None:
+    """Look at the ball lying on the mark: the origin of all measurements.
+
+    \b
+    Examples:
+      station calibrate mark
+      station calibrate mark --front
+    """
+    procedure.rest(FRONT if front else MARK)
+
+
+@calibrate.command("around")
+@_options
+def around(procedure: Procedure) -> None:
+    """Look at the ball lying on the floor beside and behind the mark: the floor's slope.
+
+    Further places are added to those that were seen.
+
+    \b
+    Examples:
+      station calibrate around
+    """
+    procedure.around(asked=False)
+
+
+@calibrate.command("depth")
+@_options
+def depth(procedure: Procedure) -> None:
+    """Look at a flat board at several distances: each sensor's own depth error.
+
+    \b
+    Examples:
+      station calibrate depth
+    """
+    procedure.walls(asked=False)
+
+
+@calibrate.command("solve")
+@_options
+def solve_again(procedure: Procedure) -> None:
+    """Solve from what was seen, and put the result into use.
+
+    \b
+    Examples:
+      station calibrate solve
+    """
+    procedure.solve()
+
+
+@calibrate.command("board")
+@click.option(
+    "--images",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    required=True,
+    help="infrared images: DIR/<camera>/<moment>.png",
+)
+@click.option("--squares", default="7x5", show_default=True, help="across x down")
+@click.option("--square", "square_m", default=0.06, show_default=True, help="side, metres")
+@click.option("--marker", "marker_m", default=0.045, show_default=True, help="side, metres")
+@click.option("--dictionary", default="DICT_4X4_100", show_default=True)
+@_options
+def board(
+    procedure: Procedure,
+    images: Path,
+    squares: str,
+    square_m: float,
+    marker_m: float,
+    dictionary: str,
+) -> None:
+    """Judge the lenses, and the calibration in use, by images of a ChArUco board.
+
+    The factory's intrinsics are kept unless the images give better ones in millimetres. Images of
+    one name were taken at one moment.
+
+    \b
+    Examples:
+      station calibrate board --images board --squares 7x5 --square 0.06 --marker 0.045
+    """
+    printed = Board(*_two_numbers(squares), square_m, marker_m, dictionary)
+    session = procedure.session()
+    views: dict[str, list[BoardView]] = {}
+    for name in session.cameras:
+        views[name] = _board_views(images / name, printed, session, name)
+        procedure.guide.say(f"camera {name}: the board is seen in {len(views[name])} images")
+    if not any(views.values()):
+        raise CalibrationError(
+            f"{images} has no image of the board: DIR/<camera>/<moment>.png, cameras "
+            f"{', '.join(session.cameras)}"
+        )
+    if procedure.store.in_use.exists():
+        ties = check_ties(Rig.load(procedure.store.in_use), views, printed)
+        for (one, other), off_m in ties.pairs.items():
+            procedure.guide.say(
+                f"{one} and {other} see the board's corners {1e3 * off_m:.1f} mm apart "
+                "through the calibration in use"
+            )
+    found: dict[str, Lens | None] = {}
+    for name, seen in views.items():
+        report = judge_lens(session.cameras[name], seen, printed)
+        procedure.guide.say(report.words())
+        lens = report.lens
+        found[name] = None if lens is None else Lens(lens.K.tolist(), lens.distortion.tolist())
+    session.keep_lenses(found)
+
+
+def _two_numbers(text: str) -> tuple[int, int]:
+    try:
+        columns, rows = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise CalibrationError(f"--squares {text}: give it as across x down, 7x5") from None
+    return columns, rows
+
+
+def _board_views(folder: Path, printed: Board, session: Session, name: str) -> list[BoardView]:
+    camera = session.cameras[name]
+    views = []
+    for path in sorted(folder.glob("*")) if folder.is_dir() else []:
+        if path.suffix.lower() not in _IMAGES:
+            continue
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise CalibrationError(f"{path} cannot be read as an image; remove it")
+        if image.shape != (camera.height, camera.width):
+            raise CalibrationError(
+                f"{path} is {image.shape[1]} x {image.shape[0]}; camera {name} has "
+                f"{camera.width} x {camera.height}"
+            )
+        view = find_board(np.asarray(image, np.uint8), printed, path.stem)
+        if view is not None:
+            views.append(view)
+    return views

@@ -1,0 +1,341 @@
+"""The cameras' frames for whoever calibrates or checks: the live ones of the running booth, or
+those of recordings replayed through the very same capture processes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from station.calibration.detect.detections import uncalibrated
+from station.core.config import BoothConfig
+from station.core.errors import CalibrationError
+from station.core.rig import CameraCalibration
+from station.core.service import die_with_parent
+from station.messaging.messages import CameraHealth, DesiredState, FrameHeader, Request, SensorInfo
+from station.messaging.topics import TOPICS
+from station.messaging.transport import ask, publisher, subscriber
+from station.sensors.base import DeviceInfo
+from station.sensors.clock import DeviceClock
+from station.sensors.recording import check_recording
+
+_POLL_S = 0.05
+_LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
+"""How many frames wait to be taken; each is 0.6 MB."""
+_STOP_S = 5.0
+_GATHER_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class TimedFrame:
+    """One depth image, with its time on a clock that all cameras share."""
+
+    camera: str
+    time_s: float
+    depth: NDArray[np.uint16]
+    """(height, width) in units of scale_m, 0 = no reading."""
+    scale_m: float
+    clock_resets: int = 0
+    """How often the camera's clock had been reset."""
+
+    def depth_m(self) -> NDArray[np.float32]:
+        return self.depth.astype(np.float32) * np.float32(self.scale_m)
+
+
+class RecordedClock:
+    """The times of a recording's frames as they were on the day, whatever the pace of its replay.
+
+    Four recordings are replayed by four processes that start one after the other and keep pace
+    each by itself; what the frames have in common is written in the recordings.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        listed = check_recording(folder)
+        self._frames = {ticks: (index, s) for index, (s, ticks, _) in enumerate(listed)}
+        self._last_index = -1
+        self._last = len(listed) - 1
+        self._clock: DeviceClock | None = None
+        self.over = False
+        """It has been seen once; from here on it starts over."""
+        self.missed = 0
+        """Frames of it that did not come, so far."""
+
+    def time_s(self, header: FrameHeader) -> float | None:
+        """When a frame was taken, or None where the recording has begun anew."""
+        found = self._frames.get(header.device_ticks)
+        if found is None:
+            raise CalibrationError(
+                f"camera {header.camera} shows a frame that its recording does not hold; "
+                "is another station running on these recordings?"
+            )
+        index, seconds = found
+        if self.over:
+            return None
+        if index <= self._last_index:
+            self.missed += self._last - self._last_index
+            self.over = True
+            return None
+        self.missed += index - self._last_index - 1
+        if self._clock is None:
+            self._clock = DeviceClock(header.tick_hz, 32)
+        self._last_index = index
+        self.over = index == self._last
+        return self._clock.host_time_s(header.device_ticks, seconds)
+
+
+class Feed:
+    """The newest frame of each camera. Use it in a ``with`` statement."""
+
+    def __init__(
+        self, config: BoothConfig, clocks: Mapping[str, RecordedClock] | None = None
+    ) -> None:
+        """``clocks``: of recordings that are replayed; their replay is started here."""
+        self._config, self._clocks = config, dict(clocks or {})
+        self._names = [camera.name for camera in config.cameras]
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        folder = config.runtime.folder
+        self._wishes = publisher(self._context, folder, "desired", "desired") if clocks else None
+        self._in = subscriber(
+            self._context,
+            folder,
+            [f"camera-{name}" for name in self._names],
+            ["depth", "health", "sensor"],
+        )
+        self._wished_s = 0.0
+        self._sensors: dict[str, SensorInfo] = {}
+        self._health: dict[str, CameraHealth] = {}
+        self._seen_s: dict[str, float] = {}
+        kept = _REPLAYED_FRAMES if clocks else _LIVE_FRAMES
+        self._waiting: deque[TimedFrame] = deque(maxlen=kept)
+        self._overrun = 0
+
+    def __enter__(self) -> Feed:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.destroy(linger=0)
+
+    @property
+    def replays(self) -> bool:
+        """Whether these are recordings, not live cameras."""
+        return bool(self._clocks)
+
+    @property
+    def over(self) -> bool:
+        """All recordings have been seen once; live cameras never end."""
+        return bool(self._clocks) and all(clock.over for clock in self._clocks.values())
+
+    @property
+    def missed(self) -> int:
+        """Frames of replayed recordings that came too fast to be taken."""
+        return self._overrun + sum(clock.missed for clock in self._clocks.values())
+
+    def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
+        """Every camera as it comes from the factory, once all of them give frames.
+
+        Raises:
+            CalibrationError: naming the cameras that give none, and why.
+        """
+        if not self._clocks:
+            answer = ask(
+                self._config.runtime.folder,
+                "control",
+                Request("start"),
+                self._config.runtime.command_timeout_s,
+            )
+            if not answer.ok:
+                raise CalibrationError(answer.error)
+        deadline_s = time.monotonic() + timeout_s
+        while missing := [
+            name for name in self._names if name not in self._sensors or name not in self._seen_s
+        ]:
+            if time.monotonic() > deadline_s:
+                why = "; ".join(f"camera {name} {self._why(name)}" for name in missing)
+                raise CalibrationError(f"{why}; check its cable, see station status")
+            self._receive(_POLL_S)
+        return {
+            name: uncalibrated(
+                name,
+                DeviceInfo(
+                    serial=sensor.serial,
+                    model=sensor.model,
+                    width=sensor.width,
+                    height=sensor.height,
+                    K=np.array(sensor.K),
+                    distortion=np.array(sensor.distortion),
+                    depth_scale_m=sensor.depth_scale_m,
+                    tick_hz=sensor.tick_hz,
+                    tick_bits=sensor.tick_bits,
+                ),
+            )
+            for name, sensor in ((name, self._sensors[name]) for name in self._names)
+        }
+
+    def frames(self, timeout_s: float = 0.2) -> list[TimedFrame]:
+        """All frames since the last call, but no more than a few seconds of them.
+
+        Raises:
+            CalibrationError: a camera has gone silent.
+        """
+        self._receive(timeout_s)
+        now_s = time.monotonic()
+        limit_s = self._config.sync.silent_after_s
+        for name, seen_s in self._seen_s.items():
+            ended = name in self._clocks and self._clocks[name].over
+            if now_s - seen_s > limit_s and not ended:
+                raise CalibrationError(
+                    f"camera {name} {self._why(name)}; what was seen so far is kept, check its "
+                    "cable and run the same command again"
+                )
+        taken = list(self._waiting)
+        self._waiting.clear()
+        return taken
+
+    def newest(self, timeout_s: float = 0.2) -> list[TimedFrame]:
+        """The newest frame of each camera since the last call: who looks is slower than they.
+
+        Of a replay all frames: it gives the same result on a slow machine.
+        """
+        if self._clocks:
+            return self.frames(timeout_s)
+        return list({frame.camera: frame for frame in self.frames(timeout_s)}.values())
+
+    def _why(self, name: str) -> str:
+        health = self._health.get(name)
+        reason = f" ({health.detail or health.state})" if health else ""
+        return f"gives no frames{reason}"
+
+    def _receive(self, timeout_s: float) -> None:
+        """Take all that has come; wait for the first of it."""
+        self._wish()
+        wait_ms = int(1000 * timeout_s)
+        while self._in.poll(wait_ms):
+            wait_ms = 0
+            topic, packed, *body = self._in.recv_multipart(copy=False)
+            kind = bytes(topic.buffer).split(b"/")[0]
+            if kind == b"health":
+                health = CameraHealth.unpack(packed.buffer)
+                self._health[health.camera] = health
+            elif kind == b"sensor":
+                sensor = SensorInfo.unpack(packed.buffer)
+                self._sensors[sensor.camera] = sensor
+            else:
+                header = FrameHeader.unpack(packed.buffer)
+                self._seen_s[header.camera] = time.monotonic()
+                frame = self._timed(header, body[0].buffer)
+                if frame is not None:
+                    self._overrun += len(self._waiting) == self._waiting.maxlen
+                    self._waiting.append(frame)
+
+    def _timed(self, header: FrameHeader, pixels: memoryview) -> TimedFrame | None:
+        clock = self._clocks.get(header.camera)
+        time_s = header.host_time_s if clock is None else clock.time_s(header)
+        if time_s is None:
+            return None
+        depth = np.frombuffer(pixels, np.uint16).reshape(header.height, header.width)
+        # Replays have the clocks of their recordings, whatever becomes of the replay's.
+        resets = header.clock_resets if clock is None else 0
+        return TimedFrame(header.camera, time_s, depth, header.depth_scale_m, resets)
+
+    def _wish(self) -> None:
+        """Capture processes of a replay have no control that tells them to stream."""
+        if self._wishes is None or set(self._health) != set(self._names):
+            return
+        now_s = time.monotonic()
+        if now_s - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
+            self._wished_s = now_s
+            self._wishes.send_multipart([b"desired", DesiredState(True).pack()])
+
+
+def gather_frames(
+    feed: Feed, names: Iterable[str], frames: int, progress: Callable[[str], None]
+) -> dict[str, list[TimedFrame]]:
+    """The next frames of every camera.
+
+    Raises:
+        CalibrationError: naming the camera that gave too few.
+    """
+    taken: dict[str, list[TimedFrame]] = {name: [] for name in names}
+    deadline_s = time.monotonic() + _GATHER_S
+    while any(len(seen) < frames for seen in taken.values()):
+        if time.monotonic() > deadline_s or feed.over:
+            break
+        for frame in feed.frames():
+            if len(taken[frame.camera]) < frames:
+                taken[frame.camera].append(frame)
+        progress(f"looking: {min(len(seen) for seen in taken.values())} of {frames} frames")
+    few = [name for name, seen in taken.items() if len(seen) < frames // 2]
+    if few:
+        raise CalibrationError(
+            f"camera {', '.join(few)} gave too few frames; see station status and do it again"
+        )
+    return taken
+
+
+@contextmanager
+def live_feed(config: BoothConfig) -> Iterator[Feed]:
+    """The frames of the booth that runs."""
+    with Feed(config) as feed:
+        yield feed
+
+
+@contextmanager
+def replayed_feed(config: BoothConfig, recordings: Path) -> Iterator[Feed]:
+    """The frames of recordings (one folder a camera), through capture processes of their own.
+
+    Raises:
+        FormatError: a recording is missing or torn.
+    """
+    clocks = {camera.name: RecordedClock(recordings / camera.name) for camera in config.cameras}
+    with tempfile.TemporaryDirectory(prefix="booth-replay-") as name:
+        folder = Path(name)
+        path = folder / "booth.toml"
+        lines = ["[runtime]", 'folder = "."', ""]
+        for camera in config.cameras:
+            driver = "recorded" if camera.driver == "recorded" else "freenect"
+            recording = str((recordings / camera.name).resolve())
+            lines += ["[[cameras]]", f'name = "{camera.name}"', f'driver = "{driver}"']
+            lines += [f"serial = {_toml(camera.serial)}", f"recording = {_toml(recording)}", ""]
+        path.write_text("\n".join(lines))
+        command = [sys.executable, "-m", "station.cli", "capture"]
+        log = (folder / "capture.log").open("w")
+        children = [
+            subprocess.Popen(
+                [*command, camera, "--config", str(path)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                preexec_fn=die_with_parent,
+            )
+            for camera in clocks
+        ]
+        try:
+            runtime = config.runtime.model_copy(update={"folder": folder})
+            with Feed(config.model_copy(update={"runtime": runtime}), clocks) as feed:
+                yield feed
+        finally:
+            for child in children:
+                child.terminate()
+            for child in children:
+                try:
+                    child.wait(_STOP_S)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                    child.wait()
+            log.close()
+
+
+def _toml(text: str) -> str:
+    """A TOML basic string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

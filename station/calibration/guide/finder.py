@@ -1,0 +1,75 @@
+"""Looks for the ball in frames as they come, beside whoever receives them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from station.calibration.detect.ball import find_ball
+from station.calibration.detect.detections import BallDetection
+from station.calibration.guide.feed import TimedFrame
+from station.calibration.guide.session import Session
+from station.core.kinect_v1 import INDEPENDENT_HZ
+
+_THREADS = 2
+_WAITING = 6
+"""More frames than that do not wait: newer ones come."""
+_APART_S = 1.0 / INDEPENDENT_HZ
+_EARLY_S, _NEAR_S = 0.1 * _APART_S, 1.5 * _APART_S
+_RESET_S = 1.0
+"""A frame that is earlier than expected by more is of a clock that was reset."""
+
+
+class BallFinder:
+    """Finds the ball of a session in front of its empty booth. Use it in a ``with`` statement."""
+
+    def __init__(self, session: Session, *, patient: bool) -> None:
+        """``patient``: no frame is left out for want of time."""
+        self._radius_m, self._cameras = session.radius_m, session.lensed_cameras()
+        self._backgrounds = {
+            name: view.depth_m()
+            for name in session.cameras
+            if (view := session.background(name)) is not None
+        }
+        self._patient = patient
+        self._due_s: dict[str, float] = {}
+        self._pool = ThreadPoolExecutor(_THREADS)
+        self._pending: deque[Future[BallDetection | None]] = deque()
+
+    def __enter__(self) -> BallFinder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def look(self, frames: Iterable[TimedFrame]) -> None:
+        """Take frames to look at: of each camera so many a second as are worth it."""
+        for frame in frames:
+            due_s = self._due_s.get(frame.camera, frame.time_s)
+            late_s = frame.time_s - due_s
+            if -_RESET_S < late_s < -_EARLY_S:
+                continue
+            if self._patient or len(self._pending) < _WAITING:
+                # What is near the beat keeps it: of 30 frames a second 20 are looked at, not 15.
+                beat_s = due_s if abs(late_s) < _NEAR_S else frame.time_s
+                self._due_s[frame.camera] = beat_s + _APART_S
+                self._pending.append(self._pool.submit(self._find, frame))
+
+    def found(self, *, wait: bool = False) -> list[BallDetection]:
+        """What was found since the last call, in the order of the frames."""
+        balls = []
+        while self._pending and (wait or self._pending[0].done()):
+            ball = self._pending.popleft().result()
+            if ball is not None:
+                balls.append(ball)
+        return balls
+
+    def _find(self, frame: TimedFrame) -> BallDetection | None:
+        return find_ball(
+            frame.depth_m(),
+            self._cameras[frame.camera],
+            self._radius_m,
+            frame.time_s,
+            background_m=self._backgrounds.get(frame.camera),
+        )

@@ -1,0 +1,226 @@
+"""What an operator is led through to calibrate a booth, step by step, up to the solution in use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from station.calibration.guide.feed import Feed, live_feed, replayed_feed
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    MARK,
+    SESSION,
+    WALL,
+    Session,
+)
+from station.calibration.guide.steps import (
+    EMPTY_FIRST,
+    covered,
+    look_at_empty_booth,
+    look_at_wall,
+    rest_ball,
+    wave_ball,
+)
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import BoothConfig
+from station.core.errors import CalibrationError
+
+_SENSORS_S = 20.0
+_MOST_BOARDS, _MOST_PLACES = 20, 20
+_AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
+"""Where the ball is laid: three places away from one line show the floor's slope both ways."""
+
+
+@dataclass(frozen=True, slots=True)
+class Procedure:
+    """A booth's calibration: each step by itself, or all that are not done yet."""
+
+    config: BoothConfig
+    store: CalibrationStore
+    recordings: Path | None
+    """DIR/<step>/<camera> in place of the live cameras."""
+    guide: Guide
+
+    def begun(self) -> Session | None:
+        """The calibration that is being done, if one is."""
+        folder = self.store.unfinished
+        return Session.load(folder) if (folder / SESSION).exists() else None
+
+    def session(self) -> Session:
+        """The calibration that is being done.
+
+        Raises:
+            CalibrationError: there is none.
+        """
+        session = self.begun()
+        if session is None:
+            last = self.store.newest()
+            raise CalibrationError(
+                "no calibration has been begun; station calibrate goes through all steps"
+                if last is None
+                else f"the last calibration, {last}, is finished; station calibrate begins another"
+            )
+        return session
+
+    def run(self) -> None:
+        """All steps that are not done yet."""
+        session = self.begun()
+        if session is not None:
+            self.guide.say(f"going on with the calibration that was begun {session.started}")
+            self.guide.say(f"  kept: {session.summary()}; a step is done anew by its own command")
+        if session is None or not session.done(EMPTY):
+            self.empty()
+        if session is None or not covered(session, self.config.reference).enough:
+            self.ball()
+        if session is None or not session.done(MARK):
+            self.rest(MARK)
+        recorded_front = self.recordings is not None and (self.recordings / FRONT).is_dir()
+        if recorded_front and (session is None or not session.done(FRONT)):
+            self.rest(FRONT)
+        if session is None or len(session.around) < len(_AROUND):
+            self.around(asked=True)
+        if session is None or not session.done(WALL):
+            self.walls(asked=True)
+        self.solve()
+
+    def empty(self) -> None:
+        """The empty booth and its floor."""
+        self.guide.step("Empty booth", "Leave the booth empty; nobody in sight of the cameras.")
+        with self._feed(EMPTY) as (feed, session):
+            look_at_empty_booth(feed, session, self.guide)
+
+    def ball(self) -> None:
+        """The ball, waved."""
+        wanted = self.config.calibrate
+        self.guide.step(
+            "Ball",
+            f"Wave the ball ({2e2 * wanted.ball_radius_m:g} cm wide) slowly through the whole "
+            f"booth for {wanted.waving_s:g} s: low and high, left and right, around the mark.",
+        )
+        with self._feed(BALL) as (feed, session):
+            self._remark_on_ghosts(session)
+            wave_ball(
+                feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
+            )
+        if covered(session, self.config.reference).enough:
+            from station.calibration.solve.refusals import check_radius
+
+            check_radius(session.balls, session.radius_m)
+
+    def rest(self, step: str) -> None:
+        """The ball on the mark, or in front of it."""
+        where = "on the mark" if step == MARK else "on the floor in front of the mark, 0.5 m away"
+        self._lay(step, where)
+
+    def around(self, asked: bool) -> None:
+        """The ball on the floor beside and behind the mark; more places where they are wanted."""
+        session = self.begun()
+        before = len(session.around) if session and self.recordings is None else 0
+        for place in range(before, before + _MOST_PLACES):
+            step = f"{AROUND}-{place}"
+            if self.recordings is not None:
+                if not (self.recordings / step).is_dir():
+                    return
+            elif place >= len(_AROUND) and (
+                asked or (place > before and not self.guide.another("Lay it at one more place?"))
+            ):
+                return
+            where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
+            exactly = ", 0.6 m away, where a lower camera sees it"
+            self._lay(step, f"on the floor {where}", exactly)
+
+    def walls(self, asked: bool) -> None:
+        """The flat board at as many places as the operator (or the recordings) likes."""
+        # Live, a further board is added to those that were seen; recordings have their own places.
+        session = self.begun()
+        if session is None or not session.done(EMPTY):
+            raise CalibrationError(EMPTY_FIRST)
+        before = session.wall_count if session and self.recordings is None else 0
+        for place in range(before, before + _MOST_BOARDS):
+            if self.recordings is not None:
+                if not (self.recordings / f"{WALL}-{place}").is_dir():
+                    return
+            elif (asked or place > before) and not self.guide.another(
+                "A flat board at several distances makes the depths better. Show it (once more)?"
+            ):
+                return
+            self.guide.step(
+                f"Flat board, place {place + 1}",
+                "Stand a flat board (1 m or wider) upright across the booth; then another place.",
+            )
+            with self._feed(f"{WALL}-{place}") as (feed, session):
+                look_at_wall(feed, session, self.guide, place)
+
+    def solve(self) -> None:
+        """The solution from what was seen, put into use."""
+        from station.calibration.solve.solution import solve
+
+        session = self.session()
+        self._check_radius(session)
+        self.guide.title("Solution")
+        solution = solve(
+            session.observations(),
+            session.lensed_cameras(),
+            radius_m=session.radius_m,
+            reference=self.config.reference,
+            front_cameras=self.config.front_cameras,
+            created=_now(),
+            progress=self.guide.progress,
+        )
+        for line in solution.summary():
+            self.guide.say(line)
+        entry = self.store.finish(solution.rig, solution.report)
+        self.store.use(entry.name)
+        self.guide.done(f"calibration {entry.name} is in use ({entry.folder})")
+
+    def _lay(self, step: str, where: str, exactly: str = "") -> None:
+        self.guide.step(f"Ball {where}", f"Lay the ball {where}{exactly}; then step back.")
+        with self._feed(step) as (feed, session):
+            self._remark_on_ghosts(session)
+            rest_ball(feed, session, self.guide, step)
+
+    def _remark_on_ghosts(self, session: Session) -> None:
+        if not session.done(EMPTY):
+            self.guide.say(
+                "the empty booth was not looked at: what is round in it may be taken for the ball "
+                "(station calibrate floor)"
+            )
+
+    @contextmanager
+    def _feed(self, step: str) -> Iterator[tuple[Feed, Session]]:
+        """Frames for a step and the calibration that is being done; begun if there is none."""
+        if self.recordings is None:
+            source = live_feed(self.config)
+        else:
+            source = replayed_feed(self.config, self.recordings / step)
+        with source as feed:
+            cameras = feed.cameras(_SENSORS_S)
+            session = self.begun()
+            if session is None:
+                session = Session.begin(
+                    self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras
+                )
+            else:
+                session.check_cameras(cameras)
+                self._check_radius(session)
+            yield feed, session
+
+    def _check_radius(self, session: Session) -> None:
+        radius_m = self.config.calibrate.ball_radius_m
+        if session.radius_m != radius_m:
+            raise CalibrationError(
+                f"the calibration that was begun {session.started} is with a ball of "
+                f"{session.radius_m:g} m and booth.toml says {radius_m:g} m "
+                "(calibrate.ball_radius_m); correct it, or begin anew with station calibrate --new"
+            )
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

@@ -1,0 +1,254 @@
+"""A calibration that is being done: what was seen so far, on disk as it comes.
+
+A folder with ``session.json``, ``sensors.json`` (the cameras as they come from the factory),
+``observations.jsonl`` (one line for each finished step, one a second while the ball is waved) and
+``scene/<camera>.npz`` (the empty booth). A line is whole or, after a crash, cut off at the next
+start; the operator goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
+from station.calibration.detect.scene import StaticView
+from station.core.errors import CalibrationError, FormatError
+from station.core.files import fsync_folder, private_folder, read_json, write_json
+from station.core.rig import CameraCalibration, Rig
+
+FORMAT = "booth-calibration-session"
+VERSIONS = frozenset({1})
+SESSION, SENSORS = "session.json", "sensors.json"
+JOURNAL, SCENE = "observations.jsonl", "scene"
+
+EMPTY, BALL, MARK, FRONT, WALL = "empty", "ball", "mark", "front", "wall"
+AROUND = "around"
+_BETWEEN_RUNS_S = 10.0
+"""Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Intrinsics that a board gave, in place of the factory's."""
+
+    K: list[list[float]]
+    distortion: list[float]
+
+
+@dataclass(slots=True)
+class Session:
+    """Everything seen so far; made by ``begin`` or ``load``."""
+
+    folder: Path
+    started: str
+    """UTC, ISO 8601."""
+    radius_m: float
+    cameras: Mapping[str, CameraCalibration]
+    """As they come from the factory: lenses known, places not."""
+    mark: list[BallDetection] = field(default_factory=list)
+    front: list[BallDetection] = field(default_factory=list)
+    balls: list[BallDetection] = field(default_factory=list)
+    planes: dict[str, list[PlaneObservation]] = field(default_factory=dict)
+    """Step -> the surfaces seen in it."""
+    around: dict[str, list[BallDetection]] = field(default_factory=dict)
+    """Place -> the ball resting on the floor there."""
+    lenses: dict[str, Lens] = field(default_factory=dict)
+    runs: int = 0
+    _later_s: float | None = 0.0
+    """What this run's times are moved by; None until its first detection."""
+
+    @classmethod
+    def begin(
+        cls, folder: Path, started: str, radius_m: float, cameras: Mapping[str, CameraCalibration]
+    ) -> Session:
+        """A new calibration in an empty folder."""
+        private_folder(folder / SCENE)
+        Rig(started, next(iter(cameras)), cameras, 0.0).save(folder / SENSORS)
+        document = {"format": FORMAT, "version": 1, "started": started, "radius_m": radius_m}
+        # Written last: a folder without it was never begun.
+        write_json(folder / SESSION, document)
+        return cls(folder, started, radius_m, cameras)
+
+    @classmethod
+    def load(cls, folder: Path) -> Session:
+        """Read what an interrupted calibration has seen.
+
+        Raises:
+            FormatError: naming the file, the line and what is wrong with it.
+        """
+        path = folder / SESSION
+        document = read_json(path, format=FORMAT, versions=VERSIONS)
+        sensors = Rig.load(folder / SENSORS)
+        try:
+            started, radius_m = str(document["started"]), float(document["radius_m"])
+        except (KeyError, TypeError, ValueError) as cause:
+            raise FormatError(
+                f"{path} cannot be used ({cause}); begin anew with station calibrate --new"
+            ) from None
+        session = cls(folder, started, radius_m, sensors.cameras)
+        session._replay_journal()
+        return session
+
+    def check_cameras(self, cameras: Mapping[str, CameraCalibration]) -> None:
+        """Refuse to mix what two different sets of cameras have seen.
+
+        Raises:
+            CalibrationError: naming the camera that is another one, missing or new.
+        """
+        for name in {**self.cameras, **cameras}:
+            then = self.cameras[name].serial if name in self.cameras else None
+            now = cameras[name].serial if name in cameras else None
+            if then != now:
+                raise CalibrationError(
+                    f"camera {name} is {now or 'not configured'} now and was {then or 'not there'} "
+                    f"when this calibration was begun ({self.started}); begin anew with "
+                    "station calibrate --new"
+                )
+
+    def lensed_cameras(self) -> dict[str, CameraCalibration]:
+        """The cameras, with the lenses that a board gave where it gave any."""
+        return {
+            name: camera
+            if (lens := self.lenses.get(name)) is None
+            else replace(camera, K=np.array(lens.K), distortion=np.array(lens.distortion))
+            for name, camera in self.cameras.items()
+        }
+
+    def observations(self) -> Observations:
+        """What the calibration is solved from."""
+        planes = [plane for seen in self.planes.values() for plane in seen]
+        return Observations(self.balls, self.mark, self.front, planes, self.around)
+
+    def done(self, step: str) -> bool:
+        """Whether a step has been finished (waving never is: more of it always helps)."""
+        if step in (MARK, FRONT):
+            return bool(getattr(self, step))
+        if step == WALL:
+            return any(name.startswith(WALL) for name in self.planes)
+        return step in self.planes
+
+    def summary(self) -> str:
+        """What was seen so far, in words."""
+        parts = {
+            "the empty booth": self.done(EMPTY),
+            f"{len(self.balls)} sightings of the waved ball": bool(self.balls),
+            "the ball on the mark": self.done(MARK),
+            "the ball in front of it": self.done(FRONT),
+            f"{len(self.around)} places around it": bool(self.around),
+            f"{self.wall_count} boards": self.done(WALL),
+        }
+        return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
+
+    def background(self, camera: str) -> StaticView | None:
+        """The empty booth as a camera sees it, if that was looked at."""
+        path = self.folder / SCENE / f"{camera}.npz"
+        return StaticView.load(path) if path.exists() else None
+
+    def keep_empty(
+        self, views: Mapping[str, StaticView], planes: Sequence[PlaneObservation]
+    ) -> None:
+        """The empty booth and its floor."""
+        for camera, view in views.items():
+            view.save(private_folder(self.folder / SCENE) / f"{camera}.npz")
+        self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
+
+    @property
+    def wall_count(self) -> int:
+        return sum(name.startswith(WALL) for name in self.planes)
+
+    def keep_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
+        """A flat board at one place ("wall-0", "wall-1", ...)."""
+        self._append({"step": place, "planes": [plane.to_json() for plane in planes]})
+
+    def keep_resting(self, step: str, balls: Sequence[BallDetection]) -> None:
+        """The ball on the mark (MARK), in front of it (FRONT) or elsewhere ("around-0", ...)."""
+        self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
+
+    def begin_run(self) -> None:
+        """From here on the ball is waved again; its times have nothing to do with those before."""
+        self._append({"step": "run"})
+
+    def keep_balls(self, balls: Sequence[BallDetection]) -> None:
+        """The waved ball, since the last call."""
+        if balls:
+            self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
+
+    def forget_balls(self) -> None:
+        """Wave from the beginning: another radius, a ball that slipped."""
+        self._append({"step": "forget-balls"})
+
+    def keep_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
+        """Intrinsics that the board constrains better than the factory's; None: the factory's."""
+        document = {
+            name: None if lens is None else {"K": lens.K, "distortion": lens.distortion}
+            for name, lens in lenses.items()
+        }
+        self._append({"step": "board", "lenses": document})
+
+    def _append(self, entry: dict[str, Any]) -> None:
+        """One line, durably, and into memory."""
+        path = self.folder / JOURNAL
+        is_new = not path.exists()
+        line = json.dumps(entry, allow_nan=False, separators=(",", ":")) + "\n"
+        with path.open("a") as stream:
+            stream.write(line)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if is_new:
+            fsync_folder(self.folder)
+        self._take(entry)
+
+    def _replay_journal(self) -> None:
+        path = self.folder / JOURNAL
+        if not path.exists():
+            return
+        data = path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            # The process died while it wrote this line: what it held was seen in the last second.
+            os.truncate(path, len(whole))
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                self._take(json.loads(line))
+            except (ValueError, KeyError, TypeError, AttributeError, FormatError) as cause:
+                raise FormatError(
+                    f"{path}: line {number} cannot be read ({cause}); begin anew with "
+                    "station calibrate --new"
+                ) from None
+
+    def _take(self, entry: Mapping[str, Any]) -> None:
+        step = str(entry["step"])
+        if step == "run":
+            self.runs += 1
+            self._later_s = None
+        elif step == "forget-balls":
+            self.balls.clear()
+        elif step == BALL:
+            seen = [BallDetection.from_json(ball) for ball in entry["balls"]]
+            later_s = self._moved_by(min(ball.time_s for ball in seen))
+            self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
+        elif step in (MARK, FRONT):
+            setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
+        elif step.startswith(AROUND):
+            self.around[step] = [BallDetection.from_json(ball) for ball in entry["balls"]]
+        elif step == "board":
+            for name, lens in entry["lenses"].items():
+                self.lenses.pop(str(name), None)
+                if lens is not None:
+                    self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
+        else:
+            self.planes[step] = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
+
+    def _moved_by(self, first_s: float) -> float:
+        """By what a run's times are moved, so that it follows the runs before."""
+        if self._later_s is None:
+            before = [ball.time_s for ball in self.balls]
+            self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
+        return self._later_s

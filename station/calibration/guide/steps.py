@@ -1,0 +1,223 @@
+"""The steps of a calibration: what is looked at in each, and when it is enough."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.detect.coverage import Coverage
+from station.calibration.detect.detections import BallDetection, PlaneObservation
+from station.calibration.detect.planes import observe_floor, observe_wall
+from station.calibration.detect.scene import Image, smoothed, static_view
+from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
+from station.calibration.guide.finder import BallFinder
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import Session
+from station.core.errors import CalibrationError
+
+EMPTY_FIRST = "the empty booth has to be looked at first: station calibrate floor"
+_EMPTY_FRAMES = 60
+_WALL_FRAMES = 30
+_RESTING_S = 60.0
+_RESTING_DETECTIONS = 12
+_RESTING_M = 0.006
+"""A ball that lies still is seen in one place within the noise of a single view."""
+_OTHERS_S = 3.0
+"""After the first camera others have so long to see it at rest, too."""
+_WRITE_EVERY_S = 1.0
+_OFTEN = 0.9
+_MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
+"""An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
+
+
+def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
+    """Keep what the cameras see of the booth without anybody in it, and its floor.
+
+    Raises:
+        CalibrationError: something moved.
+    """
+    taken = _still_frames(feed, session, guide, _EMPTY_FRAMES)
+    cameras = session.lensed_cameras()
+    floors = [
+        floor
+        for name, (stack, scale_m) in taken.items()
+        if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
+    ]
+    views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
+    session.keep_empty(views, floors)
+    seen = ", ".join(floor.camera for floor in floors)
+    guide.done(
+        f"empty booth kept; the floor is seen by {seen}"
+        if floors
+        else "empty booth kept; no camera sees the floor well, so the ball has to show it"
+    )
+
+
+def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None:
+    """Keep a flat board (or wall) at one place, as every camera that faces it sees it.
+
+    Raises:
+        CalibrationError: no camera sees a flat surface that was not there before.
+    """
+    taken = _still_frames(feed, session, guide, _WALL_FRAMES)
+    cameras, name = session.lensed_cameras(), f"wall-{place}"
+    walls: list[PlaneObservation] = []
+    for camera, (stack, scale_m) in taken.items():
+        background = _background(session, camera)
+        if background is None:
+            raise CalibrationError(EMPTY_FIRST)
+        wall = observe_wall(stack, scale_m, cameras[camera], name, background)
+        if wall is not None:
+            walls.append(wall)
+    if not walls:
+        raise CalibrationError(
+            "no camera sees a flat board: hold it upright, facing the cameras, 1 m or more wide"
+        )
+    session.keep_wall(name, walls)
+    guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
+
+
+def _still_frames(
+    feed: Feed, session: Session, guide: Guide, frames: int
+) -> dict[str, tuple[NDArray[np.uint16], float]]:
+    """Each camera's frames (n, h, w) of a booth in which nothing moves, and their scale."""
+    taken = gather_frames(feed, session.cameras, frames, guide.progress)
+    for name, seen in taken.items():
+        _check_stillness(name, seen)
+    return {
+        name: (np.stack([frame.depth for frame in seen]), seen[0].scale_m)
+        for name, seen in taken.items()
+    }
+
+
+def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
+    scale_m, half = frames[0].scale_m, len(frames) // 2
+    before = static_view((frame.depth for frame in frames[:half]), scale_m)
+    after = static_view((frame.depth for frame in frames[half:]), scale_m)
+    both = (before.share > _OFTEN) & (after.share > _OFTEN)
+    surface, surface_after = (smoothed(v.inverse_depth, v.share)[0] for v in (before, after))
+    change = np.abs(surface - surface_after)[both]
+    if float(np.mean(change > _MOVED_PER_M)) > _MOVED_SHARE:
+        raise CalibrationError(
+            f"something moved in front of camera {name}; leave the booth and do it again"
+        )
+
+
+def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
+    """Wait until the ball lies still where it was put, and keep where the cameras see it.
+
+    Raises:
+        CalibrationError: it was not seen at rest.
+    """
+    recent: dict[str, list[BallDetection]] = {name: [] for name in session.cameras}
+    still: dict[str, list[BallDetection]] = {}
+    now_s = time.monotonic()
+    give_up_s, settled_s = now_s + _RESTING_S, np.inf
+    with BallFinder(session, patient=feed.replays) as finder:
+        while now_s < min(give_up_s, settled_s) and not feed.over:
+            finder.look(feed.newest())
+            for ball in finder.found():
+                recent[ball.camera].append(ball)
+            still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
+            guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
+            now_s = time.monotonic()
+            if still:
+                settled_s = min(settled_s, now_s + _OTHERS_S)
+        for ball in finder.found(wait=True):
+            recent[ball.camera].append(ball)
+    still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
+    if not still:
+        raise CalibrationError(
+            "no camera sees the ball at rest: put it down where the lower cameras see it, take "
+            "your hands away, and check that its radius is "
+            f"{session.radius_m:g} m (calibrate.ball_radius_m)"
+        )
+    kept = [ball for seen in still.values() for ball in seen[-_RESTING_DETECTIONS:]]
+    session.keep_resting(step, kept)
+    guide.done(f"the ball at rest is seen by {', '.join(still)}")
+
+
+def _at_rest(seen: list[BallDetection]) -> bool:
+    if len(seen) < _RESTING_DETECTIONS:
+        return False
+    centers = np.array([ball.center_m for ball in seen[-_RESTING_DETECTIONS:]])
+    away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return bool(np.median(away) < _RESTING_M)
+
+
+def covered(session: Session, reference: str) -> Coverage:
+    """What has been seen of the waved ball so far."""
+    coverage = Coverage(session.lensed_cameras(), reference)
+    for ball in session.balls:
+        coverage.add(ball)
+    return coverage
+
+
+def wave_ball(
+    feed: Feed, session: Session, guide: Guide, *, reference: str, lasts_s: float
+) -> None:
+    """Keep the ball on its way through the booth, until the time is over and it is enough.
+
+    What was seen is on disk within a second; Ctrl-C ends the step and keeps it.
+    """
+    coverage = covered(session, reference)
+    session.begin_run()
+    resets: dict[str, int] = {}
+    waiting: list[BallDetection] = []
+
+    def keep(balls: list[BallDetection]) -> None:
+        for ball in balls:
+            coverage.add(ball)
+        waiting.extend(balls)
+
+    def write() -> None:
+        session.keep_balls(waiting)
+        waiting.clear()
+
+    began_s = written_s = time.monotonic()
+    with BallFinder(session, patient=feed.replays) as finder:
+        try:
+            while not feed.over:
+                for frame in feed.newest():
+                    if resets.setdefault(frame.camera, frame.clock_resets) != frame.clock_resets:
+                        # What follows cannot be put in time with what went before, of which some
+                        # is still being looked at.
+                        keep(finder.found(wait=True))
+                        write()
+                        session.begin_run()
+                        resets[frame.camera] = frame.clock_resets
+                    finder.look([frame])
+                keep(finder.found())
+                now_s = time.monotonic()
+                if now_s - written_s > _WRITE_EVERY_S:
+                    write()
+                    written_s = now_s
+                left_s = lasts_s - (now_s - began_s)
+                guide.progress(_wave_line(coverage, left_s))
+                if not feed.replays and left_s < (0.0 if coverage.enough else -lasts_s):
+                    break
+            keep(finder.found(wait=True))
+        except KeyboardInterrupt:
+            guide.say("stopped; what was seen is kept")
+        finally:
+            write()
+    if feed.replays and feed.missed:
+        guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
+    counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
+    guide.done(f"the ball was seen: {counts}")
+    for name, (near, moments) in coverage.ties().items():
+        guide.say(f"{name} is tied to {near} by {moments} moments at which both saw it")
+    if not coverage.enough:
+        guide.say(f"more would help: {coverage.advice()}")
+
+
+def _wave_line(coverage: Coverage, left_s: float) -> str:
+    time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
+    return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}"
+
+
+def _background(session: Session, camera: str) -> Image | None:
+    view = session.background(camera)
+    return None if view is None else view.depth_m()

@@ -1,0 +1,166 @@
+"""All calibrations of a booth, each in a folder named by its date; none is ever overwritten.
+
+calibrations/20261121T100000Z/   calibration.json, report.json, what it was solved from
+calibrations/unfinished/         the one that is being done
+calibrations/calibrate.lock      held by whoever calibrates
+calibration.json                 a copy of the one in use
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from station.calibration.detect.scene import StaticView
+from station.calibration.guide.session import SCENE
+from station.core.errors import CalibrationError
+from station.core.files import (
+    fsync_folder,
+    held,
+    private_folder,
+    publish_folder,
+    write_bytes,
+    write_json,
+)
+from station.core.rig import Rig
+
+CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
+_ABANDONED, LOCK = "abandoned-", "calibrate.lock"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One stored calibration."""
+
+    name: str
+    """Its date: 20261121T100000Z."""
+    folder: Path
+    rig: Rig
+    in_use: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationStore:
+    """The folder of dated calibrations, and the file that the booth reads."""
+
+    folder: Path
+    in_use: Path
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Hold the store alone: two that calibrate at once would write into one journal.
+
+        Raises:
+            CalibrationError: another process holds it.
+        """
+        busy = f"another station calibrate is at work in {self.folder}; end it first"
+        return held(self.folder / LOCK, CalibrationError(busy))
+
+    @property
+    def unfinished(self) -> Path:
+        """Where the calibration that is being done keeps what it has seen."""
+        return self.folder / UNFINISHED
+
+    def entries(self) -> list[Entry]:
+        """All stored calibrations, oldest first."""
+        if not self.folder.is_dir():
+            return []
+        return [
+            Entry(folder.name, folder, Rig.load(folder / CALIBRATION), self._is_used(folder))
+            for folder in self._folders()
+        ]
+
+    def newest(self) -> str | None:
+        """Name of the last stored calibration, if there is one."""
+        return max((folder.name for folder in self._folders()), default=None)
+
+    def _folders(self) -> list[Path]:
+        return [
+            path.parent
+            for path in sorted(self.folder.glob(f"*/{CALIBRATION}"))
+            if not path.parent.name.startswith((UNFINISHED, _ABANDONED, "."))
+        ]
+
+    def _is_used(self, folder: Path) -> bool:
+        if not self.in_use.exists():
+            return False
+        return (folder / CALIBRATION).read_bytes() == self.in_use.read_bytes()
+
+    def finish(self, rig: Rig, report: dict[str, Any]) -> Entry:
+        """Give the unfinished calibration its date and put it beside the others.
+
+        Raises:
+            CalibrationError: there is one of the same second already.
+        """
+        rig.save(self.unfinished / CALIBRATION)
+        write_json(self.unfinished / REPORT, report)
+        final = self.folder / dated(rig.created)
+        try:
+            publish_folder(self.unfinished, final)
+        except FileExistsError as cause:
+            raise CalibrationError(f"{cause}; solve again in a second") from None
+        return Entry(final.name, final, rig, in_use=False)
+
+    def set_aside(self) -> Path | None:
+        """Make room for a new calibration; what an unfinished one has seen is kept."""
+        if not self.unfinished.exists():
+            return None
+        number = 1
+        while (aside := self.folder / f"{_ABANDONED}{number}").exists():
+            number += 1
+        os.rename(self.unfinished, aside)
+        fsync_folder(self.folder)
+        return aside
+
+    def use(self, name: str) -> Entry:
+        """Make a stored calibration the one that the booth reads.
+
+        A calibration.json that came from elsewhere is put into the store first.
+
+        Raises:
+            CalibrationError: there is none of that name; names those that there are.
+        """
+        # A damaged one must not stand in the way of the others.
+        folders = {folder.name: folder for folder in self._folders()}
+        if name not in folders:
+            known = ", ".join(folders) or "none"
+            raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
+        rig = Rig.load(folders[name] / CALIBRATION)
+        if self.in_use.exists() and not any(map(self._is_used, folders.values())):
+            self._adopt()
+        write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
+        return Entry(name, folders[name], rig, in_use=True)
+
+    def _adopt(self) -> None:
+        """Keep the file in use, which is not one of ours, under the date that it bears."""
+        name = dated(Rig.load(self.in_use).created)
+        folder, number = self.folder / f"{name}-found", 1
+        while folder.exists():
+            number += 1
+            folder = self.folder / f"{name}-found-{number}"
+        temporary = private_folder(self.folder / f".{folder.name}.{os.getpid()}")
+        shutil.copyfile(self.in_use, temporary / CALIBRATION)
+        publish_folder(temporary, folder)
+
+    def scene(self) -> dict[str, StaticView]:
+        """The empty booth as it was at the calibration in use; nothing where none was stored.
+
+        Raises:
+            FormatError: naming the file that cannot be read.
+        """
+        for folder in self._folders():
+            if self._is_used(folder):
+                views = sorted((folder / SCENE).glob("*.npz"))
+                return {path.stem: StaticView.load(path) for path in views}
+        return {}
+
+
+def dated(created: str) -> str:
+    """A folder's name from an ISO 8601 date: 2026-11-21T10:00:00Z -> 20261121T100000Z."""
+    name = "".join(character for character in created if character.isalnum())
+    if not name:
+        raise CalibrationError("a calibration without a date cannot be stored")
+    return name

@@ -1,0 +1,122 @@
+"""Whether a calibration holds on detections that it was not solved from, in millimetres.
+
+Every fifth second is held out. What a camera saw then is compared with where the other cameras saw
+the ball, through the poses and corrections of the rest of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.solve.joint import local_equations
+from station.calibration.solve.pairwise import Track
+from station.calibration.solve.problem import Problem, Sightings, State
+from station.core.geometry import transform
+
+Array = NDArray[np.float64]
+
+_BLOCK_S = 1.0
+_EVERY = 5
+LARGEST_RMS_M = 0.006
+"""Of single detections, whose own noise is 1-2 mm."""
+LARGEST_MEAN_M = 0.0025
+"""Of a camera's held-out detections together, where the noise averages out."""
+_LEAST = 6
+"""Fewer comparisons prove nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """How far one camera's held-out detections lie from where the others saw the ball."""
+
+    detections: int
+    rms_m: float
+    mean_m: Array
+    """(3,) reference frame."""
+
+    @property
+    def tested(self) -> bool:
+        return self.detections >= _LEAST
+
+    @property
+    def acceptable(self) -> bool:
+        """The mean is allowed what its own noise can be."""
+        allowed = LARGEST_MEAN_M + 3.0 * self.rms_m / np.sqrt(max(self.detections, 1))
+        return self.rms_m < LARGEST_RMS_M and float(np.linalg.norm(self.mean_m)) < allowed
+
+
+def held_out(times_s: Array, start_s: float) -> NDArray[np.bool_]:
+    """Which times (n,) fall into a held-out second."""
+    return ((times_s - start_s) / _BLOCK_S).astype(np.int64) % _EVERY == _EVERY - 1
+
+
+def without_held_out(problem: Problem) -> Problem:
+    """The problem that the solution to be tested is solved from."""
+    start_s = _start(problem)
+    waved = {
+        name: seen.take(~held_out(seen.times_s, start_s)) for name, seen in problem.waved.items()
+    }
+    return replace(problem, waved=waved)
+
+
+def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
+    """Each camera's held-out detections against the other cameras', by a state solved without."""
+    start_s = _start(problem)
+    tracks = {
+        name: corrected(seen, state, problem.radius_m) for name, seen in problem.waved.items()
+    }
+    found = {}
+    for name, track in tracks.items():
+        chosen = held_out(problem.waved[name].times_s, start_s)
+        away = _differences(track, chosen, [tracks[other] for other in tracks if other != name])
+        calm = away[np.linalg.norm(away, axis=1) < 5.0 * _typical(away)] if len(away) else away
+        if len(calm) < _LEAST:
+            found[name] = HeldOut(len(calm), 0.0, np.zeros(3))
+        else:
+            rms = float(np.sqrt(np.mean(np.sum(calm**2, axis=1))))
+            found[name] = HeldOut(len(calm), rms, calm.mean(axis=0))
+    return found
+
+
+def overall_rms(found: Mapping[str, HeldOut]) -> float:
+    """Of all cameras' held-out detections."""
+    count = sum(one.detections for one in found.values())
+    return float(
+        np.sqrt(sum(one.detections * one.rms_m**2 for one in found.values()) / max(count, 1))
+    )
+
+
+def _start(problem: Problem) -> float:
+    return min(float(seen.times_s[0]) for seen in problem.waved.values() if len(seen.times_s))
+
+
+def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -> Array:
+    """(n, 3): detections less the mean of where the others saw the ball at their times."""
+    times, points = track.times_s[chosen], track.points[chosen]
+    total, count = np.zeros_like(points), np.zeros(len(points))
+    for other in others:
+        places, known = other.at(times)
+        near = known & (np.linalg.norm(places - points, axis=1) < 0.1)
+        total[near] += places[near]
+        count[near] += 1.0
+    seen = count > 0
+    return points[seen] - total[seen] / count[seen, None]
+
+
+def corrected(seen: Sightings, state: State, radius_m: float) -> Track:
+    """Detections in the reference frame after depth correction and clock offset."""
+    centers = seen.centers.copy()
+    for _ in range(4):
+        normal, pull = local_equations(seen, centers, state.corrections[seen.camera], radius_m)
+        centers -= np.linalg.solve(normal[:, :3, :3], pull[:, :3, None])[..., 0]
+    return Track(
+        seen.times_s + state.clock_s[seen.camera], transform(state.poses[seen.camera], centers)
+    )
+
+
+def _typical(away: Array) -> float:
+    return float(np.median(np.linalg.norm(away, axis=1)))

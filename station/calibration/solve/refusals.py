@@ -1,0 +1,191 @@
+"""What must not become a calibration, and what the operator reads: the cause and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.detect.coverage import Coverage
+from station.calibration.detect.detections import BallDetection, Observations
+from station.calibration.solve import clocks, world
+from station.calibration.solve.acceptance import HeldOut
+from station.calibration.solve.initial import Detections
+from station.calibration.solve.joint import MEDIAN
+from station.calibration.solve.pairwise import Pair
+from station.calibration.solve.problem import State
+from station.calibration.solve.world import Placed
+from station.core.errors import CalibrationError
+
+Array = NDArray[np.float64]
+
+_RADIUS_SHARE = 0.04
+"""How far the measured radius may lie from the given one; a depth error of 1 % moves it by 1 %."""
+_LEAST_DETECTIONS = 60
+_AGREEING_SHARE = 0.5
+_LARGEST_SIGMA_M = 0.002
+_LARGEST_SIGMA_RAD = np.radians(0.1)
+_LARGEST_SCATTER = 3.0
+SETTLED, LOST = 0.3, 10.0
+"""Last steps, in standard deviations: beyond the second nobody can tell whose fault it is."""
+_MARK_TOLERANCE_M = 0.008
+_LARGEST_SLOPE_RAD = np.radians(0.1)
+"""A body's head is 3 mm to one side at it."""
+AROUND_WORDS = (
+    "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
+    "sees it (station calibrate around)"
+)
+
+
+def check_counts(covered: Coverage) -> None:
+    if not any(covered.counts().values()):
+        raise CalibrationError("the ball has not been waved yet: station calibrate ball")
+    for name, count in covered.counts().items():
+        if count < _LEAST_DETECTIONS:
+            raise CalibrationError(
+                f"camera {name} saw the ball in {count} frames only ({_LEAST_DETECTIONS} are "
+                f"needed): check that the camera works and is not covered, and wave the ball "
+                f"where {name} looks"
+            )
+
+
+def check_radius(balls: Sequence[BallDetection], radius_m: float) -> float:
+    found = np.array([ball.radius_m for ball in balls])
+    sure = 1.0 / np.array([ball.radius_sigma_m for ball in balls])
+    order = np.argsort(found)
+    total = np.cumsum(sure[order])
+    measured = float(found[order][np.searchsorted(total, 0.5 * total[-1])])
+    if abs(measured / radius_m - 1.0) > _RADIUS_SHARE:
+        raise CalibrationError(
+            f"the ball measures {1e3 * measured:.0f} mm in radius, but {1e3 * radius_m:.0f} mm was "
+            f"given: use the right ball, or correct calibrate.ball_radius_m; then begin anew with "
+            f"station calibrate --new"
+        )
+    return measured
+
+
+def check_rest(observations: Observations, front_cameras: Sequence[str]) -> None:
+    if not observations.mark:
+        raise CalibrationError(
+            "the ball was not seen on the mark: lay it there, and run station calibrate mark"
+        )
+    if not observations.front and not front_cameras:
+        raise CalibrationError(
+            "nothing says where the person faces: name the cameras in front (calibrate.front in "
+            "booth.toml), or run station calibrate mark --front"
+        )
+
+
+def check_pairs(
+    detections: Mapping[str, Detections], pairs: Mapping[tuple[str, str], Pair]
+) -> None:
+    if not pairs:
+        raise CalibrationError(
+            "no two cameras saw the ball at one time: wave it where several of them see it"
+        )
+    tracks = {name: own.track for name, own in detections.items()}
+    check_clocks(clocks.large_jump(tracks, pairs))
+    moved = clocks.moved_camera(tracks, pairs)
+    if moved is not None:
+        raise CalibrationError(
+            f"camera {moved} was moved while the ball was waved: fix it, and wave the ball again"
+        )
+    for name in detections:
+        shares = [float(pair.agree.mean()) for key, pair in pairs.items() if name in key]
+        if shares and max(shares) < _AGREEING_SHARE:
+            raise CalibrationError(
+                f"camera {name} agrees with the others in only {100 * max(shares):.0f} % of what "
+                "it saw: something else in its view is round; take it away and wave the ball again"
+            )
+
+
+def check_clocks(jump: clocks.ClockJump | None) -> None:
+    if jump is not None:
+        raise CalibrationError(
+            f"the clock of camera {jump.camera} jumped by {1e3 * jump.jump_s:.0f} ms midway (its "
+            "USB connection was lost, or the station is overloaded): wave the ball again"
+        )
+
+
+def check_tied(cameras: Iterable[str], poses: Mapping[str, Array]) -> None:
+    apart = [name for name in cameras if name not in poses]
+    if apart:
+        raise CalibrationError(
+            f"camera {apart[0]} saw the ball too rarely together with the others: wave it longer "
+            f"where {apart[0]} and another camera see it at a time"
+        )
+
+
+def check_scatter(state: State) -> None:
+    for name, deviation in state.deviations.items():
+        scatter = float(np.sqrt(np.median(deviation) / MEDIAN)) if len(deviation) else 0.0
+        if scatter > _LARGEST_SCATTER:
+            raise CalibrationError(
+                f"camera {name} scatters {scatter:.1f} times as much as a sound sensor does: let "
+                "it warm up for 20 minutes, keep the sun out of the booth, or replace it"
+            )
+
+
+def check_settled(state: State, largest_step: float = SETTLED) -> None:
+    if not state.last_step < largest_step:
+        raise CalibrationError(
+            "the cameras contradict one another: a head or something else that is round may have "
+            "been taken for the ball; take it away, let no camera move, and wave the ball again"
+        )
+
+
+def check_held_out(found: Mapping[str, HeldOut]) -> None:
+    untested = [name for name, one in found.items() if not one.tested]
+    if untested:
+        raise CalibrationError(
+            f"camera {untested[0]} could not be tested: wave the ball longer where it and another "
+            "camera see it"
+        )
+    refused = {name: one for name, one in found.items() if not one.acceptable}
+    if refused:
+        name = max(refused, key=lambda name: refused[name].rms_m)
+        away_mm = 1e3 * float(np.linalg.norm(found[name].mean_m))
+        raise CalibrationError(
+            f"camera {name} is off by {away_mm:.1f} mm ({1e3 * found[name].rms_m:.1f} mm rms) "
+            "where it was tested: make sure that no camera moves meanwhile, let the sensors warm "
+            "up, and wave the ball again"
+        )
+
+
+def check_sigma(placed: Placed, reference: str, covered: Coverage) -> None:
+    for name in placed.world_from_camera:
+        shift, turn = world.sigma_to(placed, reference, name)
+        if shift > _LARGEST_SIGMA_M or turn > _LARGEST_SIGMA_RAD:
+            more = "" if covered.enough else f"; {covered.advice()}"
+            raise CalibrationError(
+                f"camera {name} is known to {1e3 * shift:.1f} mm and {np.degrees(turn):.2f} "
+                f"degrees only: wave the ball longer, near to {name} and far from it{more}"
+            )
+
+
+def check_slope(placed: Placed) -> None:
+    if placed.slope_sigma_rad > _LARGEST_SLOPE_RAD:
+        raise CalibrationError(
+            f"the floor's slope is known to {np.degrees(placed.slope_sigma_rad):.2f} degrees only: "
+            f"{AROUND_WORDS}"
+        )
+
+
+def check_upright(placed: Placed) -> None:
+    for name, pose in placed.world_from_camera.items():
+        if pose[2, 3] < 0.0:
+            raise CalibrationError(
+                f"camera {name} comes out {-pose[2, 3]:.2f} m below the floor: what was taken for "
+                "the ball on the mark was something else; leave the booth, lay the ball on the "
+                "mark, and run station calibrate mark"
+            )
+
+
+def check_mark(placed: Placed, radius_m: float) -> None:
+    off = placed.mark_height_m - radius_m
+    if abs(off) > _MARK_TOLERANCE_M:
+        raise CalibrationError(
+            f"the ball on the mark is {1e3 * abs(off):.0f} mm too {'high' if off > 0 else 'low'} "
+            "for one that rests on the floor: put it on the floor itself, and clear the floor"
+        )

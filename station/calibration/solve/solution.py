@@ -1,0 +1,229 @@
+"""A booth's calibration from what its cameras saw: pairs, then all at once, then the verdict.
+
+Whatever would make it wrong is refused in the operator's words, with what to do about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.detect.coverage import Coverage
+from station.calibration.detect.detections import FLOOR, Observations
+from station.calibration.solve import acceptance, clocks, refusals, world
+from station.calibration.solve.acceptance import HeldOut
+from station.calibration.solve.depth_correction import correction_of
+from station.calibration.solve.initial import (
+    Detections,
+    at_rest,
+    confirmed,
+    first_state,
+    named_surfaces,
+    resting_places,
+    sorted_detections,
+    spread_m,
+)
+from station.calibration.solve.joint import solve_joint
+from station.calibration.solve.pairwise import chain, relate_all
+from station.calibration.solve.problem import Problem, Sightings, State
+from station.calibration.solve.world import Placed
+from station.core.errors import CalibrationError
+from station.core.rig import CameraCalibration, Rig
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+_LEAST_SPREAD_M = 0.15
+"""Of the places where the ball rested, from one line, where no camera sees the floor."""
+_GOOD_SLOPE_RAD = np.radians(0.06)
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A calibration and how good it is."""
+
+    rig: Rig
+    placed: Placed
+    """Poses with the covariance between cameras."""
+    held_out: Mapping[str, HeldOut]
+    weak: tuple[str, ...]
+    """What could be better, and how; empty where nothing need be."""
+    clock_s: Mapping[str, float]
+    """Offset of each camera's clock against the reference's."""
+    radius_m: float
+    """The ball's, as all cameras measured it."""
+
+    def summary(self) -> list[str]:
+        """What the operator is told."""
+        rms_mm = 1e3 * self.rig.residual_rms_m
+        lines = [f"tested on every fifth second: {rms_mm:.1f} mm rms between cameras"]
+        for name, one in self.held_out.items():
+            shift_m, turn_rad = self._sigma(name)
+            known = (
+                "reference"
+                if name == self.rig.reference
+                else f"known to {1e3 * shift_m:.1f} mm and {np.degrees(turn_rad):.2f} degrees"
+            )
+            off_mm = 1e3 * float(np.linalg.norm(one.mean_m))
+            lines.append(f"{name}: {known}; off by {off_mm:.1f} mm in {one.detections} tests")
+        slope_deg = np.degrees(self.placed.slope_sigma_rad)
+        lines.append(f"the floor's slope is known to {slope_deg:.2f} degrees")
+        return lines + [f"could be better: {words}" for words in self.weak]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """For a JSON file beside the calibration."""
+        names = list(self.placed.world_from_camera)
+        return {
+            "residual_rms_m": self.rig.residual_rms_m,
+            "measured_radius_m": self.radius_m,
+            "slope_sigma_rad": self.placed.slope_sigma_rad,
+            "weak": list(self.weak),
+            "cameras": {
+                name: {
+                    "held_out": self.held_out[name].detections,
+                    "held_out_rms_m": self.held_out[name].rms_m,
+                    "held_out_mean_m": self.held_out[name].mean_m.tolist(),
+                    "sigma_to_reference_m": self._sigma(name)[0],
+                    "sigma_to_reference_rad": self._sigma(name)[1],
+                    "clock_offset_s": self.clock_s[name],
+                }
+                for name in names
+            },
+            "joint_covariance": {"cameras": names, "xi": self.placed.covariance.tolist()},
+        }
+
+    def _sigma(self, name: str) -> tuple[float, float]:
+        return world.sigma_to(self.placed, self.rig.reference, name)
+
+
+def solve(
+    observations: Observations,
+    cameras: Mapping[str, CameraCalibration],
+    *,
+    radius_m: float,
+    reference: str,
+    front_cameras: Sequence[str],
+    created: str,
+    progress: Progress = lambda _: None,
+) -> Solution:
+    """The calibration that agrees best with all that was seen.
+
+    ``cameras`` give lens and serial; their poses and corrections are not used. ``front_cameras``
+    stand in front of the subject: they give the heading where the ball was not put in front of the
+    mark.
+
+    Raises:
+        CalibrationError: naming the camera or the step that spoils it, and what to do.
+    """
+    progress("checking what was seen")
+    covered = Coverage(cameras, reference)
+    for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
+        covered.add(ball)
+    refusals.check_counts(covered)
+    measured_m = refusals.check_radius(observations.balls, radius_m)
+    detections = sorted_detections(observations.balls, list(cameras), radius_m)
+    refusals.check_rest(observations, front_cameras)
+
+    progress("relating pairs of cameras")
+    pairs = relate_all({name: own.track for name, own in detections.items()})
+    refusals.check_pairs(detections, pairs)
+    poses = chain(pairs, reference, list(cameras))
+    refusals.check_tied(cameras, poses)
+
+    problem = _problem(observations, cameras, detections, poses, radius_m, reference)
+    progress("solving without every fifth second")
+    training = acceptance.without_held_out(problem)
+    tested = solve_joint(training, first_state(training, poses))
+    refusals.check_settled(tested, refusals.LOST)
+    found = acceptance.compare(problem, tested)
+    refusals.check_clocks(
+        clocks.small_jump(
+            {
+                name: acceptance.corrected(seen, tested, radius_m)
+                for name, seen in training.waved.items()
+            }
+        )
+    )
+    refusals.check_scatter(tested)
+    refusals.check_held_out(found)
+
+    progress("solving with all that was seen")
+    start = first_state(problem, tested.poses)
+    state = solve_joint(
+        problem, replace(start, corrections=tested.corrections, clock_s=tested.clock_s)
+    )
+    refusals.check_settled(state)
+    placed = world.place(problem, state, front_cameras)
+    refusals.check_sigma(placed, reference, covered)
+    refusals.check_slope(placed)
+    refusals.check_upright(placed)
+    refusals.check_mark(placed, radius_m)
+    rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
+    weak = [] if covered.enough else [covered.advice()]
+    if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
+        weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
+    return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)
+
+
+def _problem(
+    observations: Observations,
+    cameras: Mapping[str, CameraCalibration],
+    detections: Mapping[str, Detections],
+    poses: Mapping[str, Array],
+    radius_m: float,
+    reference: str,
+) -> Problem:
+    agreed = confirmed(detections, poses)
+    waved = {
+        name: Sightings.of(
+            camera,
+            [d for d, good in zip(detections[name].waved, agreed[name], strict=True) if good],
+        )
+        for name, camera in cameras.items()
+    }
+    resting: dict[str, list[Sightings]] = {}
+    places = {world.MARK: observations.mark, world.FRONT: observations.front, **observations.around}
+    for place, seen in places.items():
+        views = [at_rest(seen, camera, radius_m) for camera in cameras.values()]
+        there = [view for view in views if view is not None]
+        if there:
+            resting[place] = there
+    if world.MARK not in resting:
+        raise CalibrationError(
+            "no camera saw the ball rest on the mark; put it there and leave the booth for the "
+            "two seconds that this step takes"
+        )
+    surfaces = named_surfaces(observations.planes, cameras, poses)
+    if not any(surface.surface == FLOOR for surface in surfaces):
+        spread = spread_m(np.array(list(resting_places(resting, poses).values())))
+        if spread < _LEAST_SPREAD_M:
+            raise CalibrationError(
+                "no camera saw enough of the floor, and the ball did not lie on it at three "
+                f"places away from one line: {refusals.AROUND_WORDS}"
+            )
+    return Problem(cameras, reference, radius_m, waved, resting, surfaces)
+
+
+def _rig(
+    cameras: Mapping[str, CameraCalibration],
+    placed: Placed,
+    state: State,
+    reference: str,
+    created: str,
+    rms_m: float,
+) -> Rig:
+    solved = {}
+    for i, (name, camera) in enumerate(cameras.items()):
+        own = np.s_[6 * i : 6 * i + 6]
+        solved[name] = replace(
+            camera,
+            depth_correction=correction_of(state.corrections[name]),
+            world_from_camera=placed.world_from_camera[name],
+            covariance=placed.covariance[own, own],
+        )
+    return Rig(created, reference, solved, rms_m)

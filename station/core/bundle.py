@@ -1,0 +1,224 @@
+"""The scan bundle: what capture hands to reconstruction (format "booth-bundle", version 1)."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.errors import BundleError, CalibrationError
+from station.core.files import private_folder, read_json, write_json
+from station.core.rig import Rig
+
+FORMAT = "booth-bundle"
+VERSIONS = frozenset({1})
+MANIFEST = "bundle.json"
+CALIBRATION = "calibration.json"
+_PNG_FAST = [
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
+]  # fmt: skip
+"""A sensor knows few different depths: whole readings repeat, differences of neighbours do not. So
+files are smaller unfiltered, and quicker to write and to read."""
+_ENCODERS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """Where one depth frame lies and when it was taken."""
+
+    file: str
+    """Path inside the bundle, with forward slashes."""
+    device_ticks: int
+    tick_hz: float
+    host_time_s: float
+    """Host's monotonic clock after the clock model."""
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A scan bundle's manifest and calibration; frames are read when asked for."""
+
+    folder: Path
+    scan_id: str
+    created: str
+    label: str
+    depth_scale_m: float
+    """Metres per unit of the depth images."""
+    rig: Rig
+    frames: Mapping[str, tuple[FrameRecord, ...]]
+    spread_s_max: float
+
+    def read_frame(self, camera: str, record: FrameRecord) -> NDArray[np.uint16]:
+        """One depth image (height, width) in units of depth_scale_m, 0 = no reading.
+
+        Raises:
+            BundleError: the file is missing, torn, or not a 16-bit image of the camera's size.
+        """
+        path = self.folder / record.file
+        try:
+            encoded = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        except OSError as cause:
+            raise BundleError(f"{path} cannot be read ({cause.strerror}); scan again") from None
+        if not _is_whole_png(encoded):
+            raise BundleError(f"{path} is torn or not a PNG; scan again")
+        image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        calibration = self.rig.cameras[camera]
+        expected = (calibration.height, calibration.width)
+        if image is None:
+            raise BundleError(f"{path} is torn or not a PNG; scan again")
+        if image.dtype != np.uint16 or image.shape != expected:
+            raise BundleError(
+                f"{path} is {image.dtype} {image.shape}; camera {camera} needs uint16 {expected}"
+            )
+        return np.asarray(image, dtype=np.uint16)
+
+    def depth_stack(self, camera: str) -> NDArray[np.uint16]:
+        """All depth images of a camera, (frames, height, width)."""
+        return np.stack([self.read_frame(camera, record) for record in self.frames[camera]])
+
+
+def _is_whole_png(encoded: NDArray[np.uint8]) -> bool:
+    """OpenCV decodes a torn PNG to black rows in silence: ask for its first and last chunk."""
+    data = encoded.tobytes()
+    return data.startswith(b"\x89PNG\r\n\x1a\n") and data[-8:-4] == b"IEND"
+
+
+def read_bundle(folder: Path) -> Bundle:
+    """Read and check a bundle's manifest and calibration.
+
+    Raises:
+        FormatError: a file is missing, torn, of an unknown version, or contradicts the others;
+            the message names it.
+        CalibrationError: a camera of the bundle is not in its calibration.
+    """
+    path = folder / MANIFEST
+    if not folder.is_dir():
+        raise BundleError(f"{folder} is not a folder; give the folder of a scan bundle")
+    document = read_json(path, format=FORMAT, versions=VERSIONS, error=BundleError)
+    rig = Rig.load(folder / CALIBRATION)
+    try:
+        frames = {
+            str(camera): tuple(_record(entry) for entry in fields["frames"])
+            for camera, fields in document["cameras"].items()
+        }
+        scale = float(document["depth_scale_m"])
+        bundle = Bundle(
+            folder=folder,
+            scan_id=str(document["scan_id"]),
+            created=str(document["created"]),
+            label=str(document.get("label", "")),
+            depth_scale_m=scale,
+            rig=rig,
+            frames=frames,
+            spread_s_max=float(document["sync"]["spread_s_max"]),
+        )
+    except KeyError as missing:
+        raise BundleError(f"{path}: the field {missing} is missing; scan again") from None
+    except (TypeError, ValueError, AttributeError) as cause:
+        raise BundleError(f"{path}: {cause}; scan again") from None
+    if not (np.isfinite(scale) and 0.0 < scale < 0.1):
+        raise BundleError(f"{path}: depth_scale_m is {scale}; metres per unit were expected")
+    if not any(frames.values()):
+        raise BundleError(f"{path}: no camera has a frame; scan again")
+    for camera in frames:
+        if camera not in rig.cameras:
+            known = ", ".join(rig.cameras)
+            raise CalibrationError(
+                f"{path}: camera {camera} is not in calibration.json (it has: {known}); "
+                "calibrate the booth anew"
+            )
+    return bundle
+
+
+def _record(entry: Mapping[str, Any]) -> FrameRecord:
+    file = str(entry["file"])
+    name = PurePosixPath(file)
+    if name.is_absolute() or ".." in name.parts:
+        raise ValueError(f"the frame file {file!r} lies outside the bundle")
+    return FrameRecord(
+        file=file,
+        device_ticks=int(entry["device_ticks"]),
+        tick_hz=float(entry["tick_hz"]),
+        host_time_s=float(entry["host_time_s"]),
+        sequence=int(entry["sequence"]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedFrame:
+    """A depth frame on its way into a bundle."""
+
+    depth: NDArray[np.uint16]
+    device_ticks: int
+    tick_hz: float
+    host_time_s: float
+    sequence: int
+
+
+def write_bundle(
+    folder: Path,
+    *,
+    scan_id: str,
+    created: str,
+    label: str,
+    depth_scale_m: float,
+    rig: Rig,
+    frames: Mapping[str, Sequence[CapturedFrame]],
+    spread_s_max: float,
+) -> None:
+    """Write a bundle's files into a new folder; publishing it under its final name is the caller's.
+
+    Args:
+        frames: per camera, in order of time.
+
+    Raises:
+        FileExistsError: the folder is there already.
+        OSError: the disk refused; what was written is removed.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(mode=0o700)
+    try:
+        cameras = {name: _write_frames(folder, name, taken) for name, taken in frames.items()}
+        rig.save(folder / CALIBRATION)
+        manifest = {
+            "format": FORMAT,
+            "version": 1,
+            "scan_id": scan_id,
+            "created": created,
+            "label": label,
+            "depth_scale_m": depth_scale_m,
+            "cameras": cameras,
+            "sync": {"spread_s_max": spread_s_max},
+        }
+        write_json(folder / MANIFEST, manifest)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _write_frames(folder: Path, camera: str, taken: Sequence[CapturedFrame]) -> dict[str, Any]:
+    private_folder(folder / "depth" / camera)
+
+    def write(index: int) -> dict[str, Any]:
+        frame = taken[index]
+        file = f"depth/{camera}/{index:03d}.png"
+        done, encoded = cv2.imencode(".png", frame.depth, _PNG_FAST)
+        if not done:
+            raise BundleError(f"{folder / file}: the frame cannot be written as a PNG")
+        (folder / file).write_bytes(encoded.tobytes())
+        record = FrameRecord(
+            file, frame.device_ticks, frame.tick_hz, frame.host_time_s, frame.sequence
+        )
+        return asdict(record)
+
+    # Encoding leaves the interpreter free: the person waits for it.
+    with ThreadPoolExecutor(max_workers=_ENCODERS) as pool:
+        return {"frames": list(pool.map(write, range(len(taken))))}

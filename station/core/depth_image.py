@@ -1,0 +1,20 @@
+"""Depth images: where neighbouring readings lie on one surface."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+JUMP_RATIO = 0.02
+"""Neighbouring readings of one surface differ by less than this share of their depth a pixel."""
+
+
+def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:
+    """Pixels within a radius of a depth discontinuity, where readings mix two surfaces."""
+    window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
+    seen = depth_m > 0
+    far = cv2.dilate(depth_m, window)
+    near = cv2.erode(np.where(seen, depth_m, np.float32(99.0)), window)
+    return np.asarray(seen & (far - near > JUMP_RATIO * radius_px * depth_m))

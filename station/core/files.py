@@ -1,0 +1,131 @@
+"""Files that survive a crash: whole under their final name, or not there at all."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import uuid
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from station.core.errors import BoothError, FormatError
+
+PRIVATE_FOLDER_MODE = 0o700
+"""Body scans are personal data: nobody but the service's user reads them."""
+
+
+def fsync_folder(folder: Path) -> None:
+    """Make the names in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def fsync_file(path: Path) -> None:
+    """Make a file's content durable."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def private_folder(folder: Path) -> Path:
+    """Create a folder (and its parents) that only its owner may read."""
+    folder.mkdir(mode=PRIVATE_FOLDER_MODE, parents=True, exist_ok=True)
+    return folder
+
+
+@contextmanager
+def held(path: Path, busy: BoothError) -> Iterator[None]:
+    """Hold a lock file alone; leaving the block frees it, and so does the end of the process.
+
+    Raises:
+        BoothError: `busy`, where another process holds it.
+    """
+    private_folder(path.parent)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise busy from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    fsync_folder(path.parent)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write JSON durably and atomically; NaN and infinity are refused (they are not JSON)."""
+    text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def read_json(
+    path: Path,
+    *,
+    format: str,
+    versions: Collection[int],
+    error: type[FormatError] = FormatError,
+) -> dict[str, Any]:
+    """Read a JSON document of a known format and version.
+
+    Raises:
+        FormatError (or the subclass ``error``): the file is missing, torn, of another format, or
+            of a version not in ``versions``; the message names the file and what was found.
+    """
+    try:
+        document = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise error(f"{path} is missing; a {format} file was expected there") from None
+    except (OSError, ValueError) as cause:
+        raise error(
+            f"{path} cannot be read as JSON ({cause}); restore it from its source"
+        ) from None
+    found = document.get("format") if isinstance(document, dict) else type(document).__name__
+    if found != format:
+        raise error(f"{path} is not a {format} file (its format is {found!r})")
+    version = document.get("version")
+    if isinstance(version, bool) or version not in versions:
+        readable = ", ".join(str(known) for known in sorted(versions))
+        raise error(f"{path} has {format} version {version!r}; this program reads {readable}")
+    return dict(document)
+
+
+def publish_folder(temporary: Path, final: Path) -> None:
+    """Give a finished folder its final name: fsync everything in it, rename, fsync the parent.
+
+    Both must lie in one file system. ``final`` must not exist: a result is never overwritten.
+
+    Raises:
+        FileExistsError: ``final`` is there already.
+    """
+    if final.exists():
+        raise FileExistsError(f"{final} exists already")
+    for root, _, names in os.walk(temporary):
+        for name in names:
+            fsync_file(Path(root) / name)
+        fsync_folder(Path(root))
+    os.rename(temporary, final)
+    fsync_folder(final.parent)
+    if temporary.parent != final.parent:
+        fsync_folder(temporary.parent)

@@ -1,1 +1,0 @@
-"""Depth sensors behind one interface."""

@@ -1,0 +1,106 @@
+"""How sockets are made: local ipc with limits, timeouts and private files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import zmq
+
+from station.core.errors import BoothError
+from station.core.files import private_folder
+from station.messaging.messages import Reply, Request
+from station.messaging.topics import TOPICS
+
+_LONGEST_PATH = 100
+"""The kernel allows 107 bytes for a socket's path."""
+MAX_MESSAGE_BYTES = 16 << 20
+
+
+def endpoint(runtime_folder: Path, name: str) -> str:
+    """The ipc address of a named socket in the booth's runtime folder.
+
+    A folder with too long a path is stood in for by a short private one derived from it.
+    """
+    folder = runtime_folder
+    if len(str(folder / f"{name}.ipc").encode()) > _LONGEST_PATH:
+        digest = hashlib.sha256(str(runtime_folder).encode()).hexdigest()[:12]
+        folder = Path(tempfile.gettempdir()) / f"booth-{os.getuid()}-{digest}"
+    private_folder(folder)
+    if folder.stat().st_uid != os.getuid():
+        raise BoothError(f"{folder} belongs to another user; set runtime.folder in booth.toml")
+    return f"ipc://{folder / name}.ipc"
+
+
+def _socket(context: zmq.Context[zmq.Socket[bytes]], kind: int, hwm: int) -> zmq.Socket[bytes]:
+    socket = context.socket(kind)
+    socket.set(zmq.LINGER, 0)
+    socket.set(zmq.SNDHWM, hwm)
+    socket.set(zmq.RCVHWM, hwm)
+    socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+    socket.set(zmq.SNDTIMEO, 1000)
+    return socket
+
+
+def publisher(
+    context: zmq.Context[zmq.Socket[bytes]], runtime_folder: Path, name: str, topic: str
+) -> zmq.Socket[bytes]:
+    """A bound PUB socket, its file readable by the owner alone."""
+    return _bound(context, zmq.PUB, runtime_folder, name, TOPICS[topic].high_water_mark)
+
+
+def server(
+    context: zmq.Context[zmq.Socket[bytes]], runtime_folder: Path, name: str
+) -> zmq.Socket[bytes]:
+    """A bound ROUTER socket for requests."""
+    return _bound(context, zmq.ROUTER, runtime_folder, name, 64)
+
+
+def _bound(
+    context: zmq.Context[zmq.Socket[bytes]], kind: int, runtime_folder: Path, name: str, hwm: int
+) -> zmq.Socket[bytes]:
+    socket = _socket(context, kind, hwm)
+    address = endpoint(runtime_folder, name)
+    mask = os.umask(0o177)
+    try:
+        socket.bind(address)
+    finally:
+        os.umask(mask)
+    return socket
+
+
+def subscriber(
+    context: zmq.Context[zmq.Socket[bytes]],
+    runtime_folder: Path,
+    names: list[str],
+    topics: list[str],
+) -> zmq.Socket[bytes]:
+    """A SUB socket connected to publishers by name."""
+    hwm = max(TOPICS[topic.split("/")[0]].high_water_mark for topic in topics)
+    socket = _socket(context, zmq.SUB, hwm)
+    for topic in topics:
+        socket.subscribe(topic)
+    for name in names:
+        socket.connect(endpoint(runtime_folder, name))
+    return socket
+
+
+def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> Reply:
+    """Send a request and wait for its reply.
+
+    Raises:
+        BoothError: nobody answered in time.
+    """
+    with zmq.Context() as context, _socket(context, zmq.REQ, 4) as socket:
+        socket.set(zmq.RCVTIMEO, int(1000 * timeout_s))
+        socket.connect(endpoint(runtime_folder, name))
+        try:
+            socket.send(request.pack())
+            return Reply.unpack(socket.recv())
+        except zmq.Again:
+            raise BoothError(
+                f"the station's {name} process does not answer within {timeout_s:g} s; "
+                "is it running? start it with: station run"
+            ) from None

@@ -1,0 +1,69 @@
+"""What every depth sensor driver gives, whatever the sensor.
+
+A driver adds itself to ``station.sensors.registry``; nothing else has to know it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """A sensor as it was opened."""
+
+    serial: str
+    model: str
+    width: int
+    height: int
+    K: NDArray[np.float64]
+    """Intrinsics of the depth image, 3x3, pixels."""
+    distortion: NDArray[np.float64]
+    """(k1, k2, p1, p2, k3) after OpenCV."""
+    depth_scale_m: float
+    """Metres per unit of the depth frames."""
+    tick_hz: float
+    """Nominal rate of the device clock."""
+    tick_bits: int
+    """The device clock wraps after 2 ** tick_bits ticks."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFrame:
+    """One depth image as the sensor gave it."""
+
+    depth: NDArray[np.uint16]
+    """(height, width) in units of ``DeviceInfo.depth_scale_m``; 0 = no reading."""
+    device_ticks: int
+    host_time_s: float
+    """Monotonic host time at which the frame was received."""
+    sequence: int
+    """Counts the frames that the sensor delivered; a gap is a loss."""
+
+
+class DepthDriver(Protocol):
+    """A sensor's life: open, read until closed. One thread calls all three."""
+
+    def open(self) -> DeviceInfo:
+        """Start the sensor.
+
+        Raises:
+            DriverError: naming the sensor's serial (or recording) and the remedy.
+        """
+        ...
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        """The next frame, or None if none came within the time.
+
+        Raises:
+            DriverError: the sensor is gone for good and has to be opened anew.
+        """
+        ...
+
+    def close(self) -> None:
+        """Stop the sensor; harmless when it was never opened."""
+        ...

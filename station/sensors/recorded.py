@@ -1,0 +1,71 @@
+"""Recordings read without libfreenect, with their own timing, over and over."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from station.core.errors import DriverError, FormatError
+from station.sensors.base import DepthFrame, DeviceInfo
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.sensors.recording import check_recording, read_raw
+
+KINECT_V1_FOCAL_PX = 585.0
+TICK_HZ = 60_000_000
+
+
+def kinect_v1(serial: str) -> DeviceInfo:
+    """A Kinect v1 with nominal intrinsics; the calibration holds the real ones."""
+    f = KINECT_V1_FOCAL_PX
+    return DeviceInfo(
+        serial=serial,
+        model="kinect-v1",
+        width=640,
+        height=480,
+        K=np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]),
+        distortion=np.zeros(5),
+        depth_scale_m=DEPTH_SCALE_M,
+        tick_hz=TICK_HZ,
+        tick_bits=32,
+    )
+
+
+class RecordedDriver:
+    """Plays a recording folder; after the last frame it starts over, as a replayed sensor does."""
+
+    def __init__(self, recording: Path, serial: str = "") -> None:
+        self._recording, self._serial = recording, serial
+        self._frames: list[tuple[float, int, Path]] = []
+        self._sequence = 0
+        self._start_s = 0.0
+
+    def open(self) -> DeviceInfo:
+        try:
+            self._frames = check_recording(self._recording)
+        except FormatError as cause:
+            raise DriverError(str(cause)) from None
+        self._start_s = time.monotonic()
+        self._sequence = 0
+        return kinect_v1(self._serial or f"recorded:{self._recording.name}")
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        first_s, last_s = self._frames[0][0], self._frames[-1][0]
+        passes, index = divmod(self._sequence, len(self._frames))
+        period_s = (last_s - first_s) * (1.0 + 1.0 / max(len(self._frames) - 1, 1))
+        seconds, ticks, path = self._frames[index]
+        wait_s = self._start_s + passes * period_s + seconds - first_s - time.monotonic()
+        time.sleep(max(0.0, min(wait_s, timeout_s)))
+        if wait_s > timeout_s:
+            return None
+        try:
+            depth = TABLE[read_raw(path) & 2047]
+        except (OSError, ValueError, FormatError) as cause:
+            raise DriverError(f"{path} cannot be read ({cause}); record again") from None
+        frame = DepthFrame(depth, ticks, time.monotonic(), self._sequence)
+        self._sequence += 1
+        return frame
+
+    def close(self) -> None:
+        self._frames = []

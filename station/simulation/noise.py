@@ -1,0 +1,154 @@
+"""What a structured-light Kinect v1 does to a true depth image.
+
+Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
+and fly: Nguyen, Izadi & Lovell 2012. (What reads the images assumes the other published law, that
+of Khoshelham & Elberink: it shall not be judged by its own assumption.) Errors are correlated over
+the matching window of about 9 x 9 px; there is no reading beyond 70-75 degrees of incidence or in
+the projector's shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.sensors.raw11 import NO_READING
+
+BASELINE_M = 0.075
+_WINDOW_PX = 9
+_FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
+_STEEP_RAD = np.radians(60.0)
+_RANGE_M = (0.5, 4.5)
+_MIDDLE_M = 1.0 / 0.6
+"""From here a unit's curvature counts."""
+
+Image = NDArray[np.float32]
+
+
+def raw_from_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """The nearest raw 11-bit values; no reading where the depth is 0 or out of range."""
+    seen = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
+    raw = 2842.5 * (np.arctan(np.where(seen, depth_m, 1.0) / 0.1236) - 1.1863)
+    return np.where(seen, np.clip(np.rint(raw), 0, NO_READING - 1), NO_READING).astype(np.uint16)
+
+
+@dataclass(frozen=True, slots=True)
+class TrueView:
+    """What a perfect sensor would see, (h, w) each."""
+
+    depth_m: Image
+    """Distance along the optical axis; 0 = nothing."""
+    incidence_rad: Image
+    lit: NDArray[np.bool_]
+    """Where the projector's light arrives."""
+    reflects: NDArray[np.bool_]
+    """False on dark hair or underwear, which give no reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where a part of an image lies in the whole."""
+
+    top: int
+    left: int
+    image_height: int
+    image_width: int
+
+
+@dataclass(frozen=True, slots=True)
+class UnitError:
+    """One sensor's smooth systematic depth error."""
+
+    bias_m: float = 0.0
+    """Its size at 2 m, growing with z^2."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """How much it changes over the image, relative, per half width and half height."""
+    gain: float = 0.0
+    """Relative error of all inverse depths: a baseline or a focal length that is not quite so."""
+    curvature: float = 0.0
+    """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
+
+    def apply(self, depth_m: Image, window: Window | None = None) -> Image:
+        """The depths that the unit reports; of a part of the image where a window is given."""
+        if self == UnitError():
+            return depth_m
+        window = window or Window(0, 0, *depth_m.shape)
+        height, width = depth_m.shape
+        x = np.linspace(-1.0, 1.0, window.image_width, dtype=np.float32)
+        y = np.linspace(-1.0, 1.0, window.image_height, dtype=np.float32)
+        shape = (
+            1.0
+            + self.tilt[0] * x[None, window.left : window.left + width]
+            + self.tilt[1] * y[window.top : window.top + height, None]
+        )
+        off = 0.25 * self.bias_m * shape * np.square(depth_m) + self.gain * depth_m
+        off += self.curvature * np.square(1.0 - depth_m / _MIDDLE_M)
+        return np.where(depth_m > 0.0, depth_m + off, 0.0).astype(np.float32)
+
+
+def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
+    """Standard deviation of a reading along the axis (Nguyen, Izadi & Lovell 2012), metres."""
+    facing = 0.0012 + 0.0019 * np.square(depth_m - 0.4)
+    angle = np.minimum(incidence_rad, np.float32(1.5))
+    steep = np.square(angle / (0.5 * np.pi - angle)) * (1e-4 / np.sqrt(np.maximum(depth_m, 0.1)))
+    return np.asarray(facing + np.where(angle > _STEEP_RAD, steep, 0.0), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class NoiselessView:
+    """What one unit would read of a view without its noise, (h, w) each."""
+
+    depth_m: Image
+    seen: NDArray[np.bool_]
+    sigma_m: Image
+    fade: Image
+    """Probability of no reading at a slant."""
+
+    @classmethod
+    def of(cls, view: TrueView, unit: UnitError, window: Window | None = None) -> NoiselessView:
+        """Of a part of the image where a window is given."""
+        depth = unit.apply(view.depth_m, window)
+        return cls(
+            depth_m=depth,
+            seen=(depth > 0) & view.lit & view.reflects,
+            sigma_m=axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD)),
+            fade=(view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD),
+        )
+
+    def read(self, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """One noisy raw 11-bit frame (h, w)."""
+        white = rng.standard_normal(self.depth_m.shape, dtype=np.float32)
+        blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
+        noise = blurred / max(float(blurred.std()), 1e-6)
+        measured = np.where(self.seen, self.depth_m + self.sigma_m * noise, 0.0).astype(np.float32)
+        measured[rng.random(self.depth_m.shape, dtype=np.float32) < self.fade] = 0.0
+        return raw_from_depth(_flying(measured, rng))
+
+
+def observe(
+    view: TrueView, unit: UnitError, rng: np.random.Generator, window: Window | None = None
+) -> NDArray[np.uint16]:
+    """One noisy raw 11-bit frame (h, w) of what a perfect sensor would see."""
+    return NoiselessView.of(view, unit, window).read(rng)
+
+
+def _flying(depth: Image, rng: np.random.Generator) -> Image:
+    """Silhouette pixels flicker: some vanish, some jump to the other side, some lie between."""
+    filled = np.where(depth > 0, depth, np.float32(9.0))
+    window = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(filled, window), cv2.dilate(filled, window)
+    edge = np.flatnonzero(far - near > 0.05)
+    fate = rng.random(depth.shape, dtype=np.float32).ravel()[edge]
+    share = rng.random(depth.shape, dtype=np.float32).ravel()[edge]
+    near, far = near.ravel()[edge], far.ravel()[edge]
+    far = np.where(far > 8.0, near, far)
+    result = depth.ravel().copy()
+    result[edge[fate < 0.30]] = 0.0
+    swapped = (fate >= 0.30) & (fate < 0.55)
+    result[edge[swapped]] = near[swapped]
+    flying = (fate >= 0.55) & (fate < 0.65)
+    result[edge[flying]] = (near + (far - near) * share)[flying]
+    return result.reshape(depth.shape)

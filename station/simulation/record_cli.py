@@ -1,0 +1,122 @@
+"""`station record-virtual`: a whole virtual booth as recordings that libfreenect replays."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import click
+
+from station.sensors.recording import RecordedFrame, write_recording
+from station.simulation.procedure import EMPTY, STRIDE, VirtualProcedure
+from station.simulation.scene import fixed_posts, load_mesh
+from station.simulation.sensor import (
+    TICK_HZ,
+    SimulatedBooth,
+    VirtualCamera,
+    recorded_frames,
+)
+
+PROCEDURE, TRUTH = "procedure", "true-calibration.json"
+_UNIT_BIAS_M = 0.010
+"""Each unit's systematic depth error where a calibration has to find it."""
+_BOARD_AT_M = (-0.6, 0.0, 0.6)
+_PROCESSES = 2
+
+
+@click.command()
+@click.option(
+    "--body", type=click.Path(path_type=Path), required=True, help=".npz, .ply or .obj in metres"
+)
+@click.option(
+    "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="folder to write"
+)
+@click.option("--seed", default=0, show_default=True, help="of the noise and the clocks")
+@click.option("--frames", default=30, show_default=True, help="different frames per camera")
+@click.option("--passes", default=40, show_default=True, help="how often they are repeated")
+@click.option(
+    "--driver",
+    type=click.Choice(["freenect", "recorded"]),
+    default="freenect",
+    show_default=True,
+    help="how the booth.toml written beside them reads them",
+)
+@click.option(
+    "--calibration",
+    "waving_s",
+    type=float,
+    help="also record a calibration, the ball waved for so many seconds; sensors then have depth "
+    "errors of their own, and no calibration.json is written",
+)
+def record_virtual(
+    body: Path,
+    out_folder: Path,
+    seed: int,
+    frames: int,
+    passes: int,
+    driver: str,
+    waving_s: float | None,
+) -> None:
+    """Render a person in a virtual booth as one recording a camera, with booth.toml.
+
+    \b
+    Examples:
+      station record-virtual --body station/simulation/bodies/ann.npz --out demo/booth
+      station run --config demo/booth/booth.toml
+      station record-virtual --body ann.npz --out demo/booth --calibration 60
+      station calibrate --config demo/booth/booth.toml --recordings demo/booth/procedure
+    """
+    bias_m = 0.0 if waving_s is None else _UNIT_BIAS_M
+    booth = SimulatedBooth(seed=seed, bias_m=bias_m, clutter=fixed_posts())
+    jobs: dict[str, Callable[[], int]] = {
+        f"camera {name}": partial(
+            _record_person, booth, name, body, out_folder / name, frames, passes
+        )
+        for name in booth.rig.cameras
+    }
+    if waving_s is not None:
+        procedure = VirtualProcedure(booth, waving_s=waving_s, board_at_m=_BOARD_AT_M)
+        for step in procedure.steps:
+            for name in booth.rig.cameras:
+                folder = out_folder / PROCEDURE / step / name
+                jobs[f"{step}, camera {name}"] = partial(
+                    _record_step, procedure, name, step, folder
+                )
+    # Spawned: a forked child would share the ray caster's threads.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(_PROCESSES, mp_context=context) as pool:
+        running = {what: pool.submit(job) for what, job in jobs.items()}
+        for what, job in running.items():
+            click.echo(f"recorded {what}: {job.result()} frames")
+    lines = ["# A virtual booth: four replayed Kinects.", ""]
+    for name in booth.rig.cameras:
+        lines += ["[[cameras]]", f'name = "{name}"', f'driver = "{driver}"']
+        lines += [f'recording = "{name}"', ""]
+    booth.rig.save(out_folder / (TRUTH if waving_s is not None else "calibration.json"))
+    if waving_s is not None:
+        lines += ["[calibrate]", f"waving_s = {waving_s:g}", ""]
+    (out_folder / "booth.toml").write_text("\n".join(lines))
+    click.echo(out_folder / "booth.toml")
+
+
+def _record_person(
+    booth: SimulatedBooth, name: str, body: Path, folder: Path, frames: int, passes: int
+) -> int:
+    camera = VirtualCamera(booth, name, load_mesh(body))
+    return write_recording(folder, recorded_frames(camera, frames), tick_hz=TICK_HZ, passes=passes)
+
+
+def _record_step(procedure: VirtualProcedure, name: str, step: str, folder: Path) -> int:
+    # In the empty booth the floor is hardly seen: each frame counts.
+    stride = 1.0 if step == EMPTY else STRIDE
+    return write_recording(folder, _frames_of(procedure, name, step, stride), tick_hz=TICK_HZ)
+
+
+def _frames_of(
+    procedure: VirtualProcedure, name: str, step: str, stride: float
+) -> Iterator[RecordedFrame]:
+    for frame in procedure.frames(name, step, stride=stride):
+        yield RecordedFrame(frame.time_s, frame.ticks, frame.raw)

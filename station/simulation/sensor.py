@@ -1,0 +1,248 @@
+"""The virtual Kinect: a body mesh seen by simulated sensors, live, as recordings or as a bundle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.bundle import CapturedFrame, write_bundle
+from station.core.errors import DriverError, InputError
+from station.core.rig import Rig
+from station.sensors.base import DepthFrame, DeviceInfo
+from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.sensors.recording import RecordedFrame
+from station.simulation.noise import TrueView, UnitError, observe
+from station.simulation.scene import (
+    Mesh,
+    VirtualScene,
+    booth_walls,
+    default_rig,
+    load_mesh,
+    moved,
+    uneven,
+)
+
+Array = NDArray[np.float64]
+
+TICK_HZ = 60_000_000
+FRAME_RATE_HZ = 30.0
+_SWAY_PERIOD_S = 3.1
+_LEAN_STEP_M = 0.00025
+"""A view is rendered anew when the person leans by so much more: far below the sensor's noise."""
+_LIVE_LOOP_FRAMES = 24
+_FACTORY_SIGMA = (3e-4, 1.5e-3)
+"""Gain and curvature of inverse depth among units that have depth errors at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedBooth:
+    """What can go right and wrong in a virtual booth; the defaults are an ordinary day."""
+
+    rig: Rig = field(default_factory=default_rig)
+    """The calibration that the station believes."""
+    seed: int = 0
+    sway_m: float = 0.002
+    """How far the head moves to either side, in a period of three seconds."""
+    bias_m: float = 0.0
+    """Size of each unit's systematic depth error at 2 m."""
+    drop_rate: float = 0.0
+    """Share of the frames that are lost."""
+    moved_cameras: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Camera -> (metres, radians) by which it stands off its calibration."""
+    dead_cameras: Collection[str] = ()
+    """Cameras that give no frame."""
+    clutter: Sequence[Mesh] = ()
+    """Further objects: a chair, a second person."""
+    walls: bool = True
+    uneven_floor_m: float = 0.0
+    uneven_board_m: float = 0.0
+    """How far its floor, and a board that is held up in it, are off flat."""
+
+    @property
+    def fixtures(self) -> list[Mesh]:
+        """What stands in it beside the person."""
+        if not self.walls:
+            return [*self.clutter]
+        floor, *walls = booth_walls()
+        rng = np.random.default_rng((self.seed, 6))
+        return [uneven(floor, 2, self.uneven_floor_m, rng), *walls, *self.clutter]
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualFrame:
+    """One raw frame with the unit's own clock."""
+
+    time_s: float
+    ticks: int
+    sequence: int
+    raw: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedUnit:
+    """What distinguishes one sensor from the next of its kind."""
+
+    error: UnitError
+    drift: float
+    phase_s: float
+    first_tick: int
+
+    @classmethod
+    def of(cls, booth: SimulatedBooth, name: str) -> SimulatedUnit:
+        """A camera's unit; the same in every simulation of this booth."""
+        index = list(booth.rig.cameras).index(name)
+        rng = np.random.default_rng((booth.seed, index, 1))
+        made = np.random.default_rng((booth.seed, index, 5)).normal(0.0, _FACTORY_SIGMA)
+        return cls(
+            error=UnitError(
+                booth.bias_m * rng.uniform(-1.0, 1.0),
+                tuple(rng.uniform(-0.3, 0.3, 2)),
+                *(made if booth.bias_m else (0.0, 0.0)),
+            ),
+            drift=rng.uniform(-80e-6, 80e-6),
+            phase_s=rng.uniform(0.0, 1.0 / FRAME_RATE_HZ),
+            first_tick=int(rng.integers(0, 2**32)),
+        )
+
+    def ticks(self, time_s: float) -> int:
+        """The device's counter, which wraps."""
+        return (self.first_tick + round(time_s * TICK_HZ * (1.0 + self.drift))) % 2**32
+
+
+class VirtualCamera:
+    """One simulated unit in front of a body; the same seed gives the same frames."""
+
+    def __init__(self, booth: SimulatedBooth, name: str, body: Mesh | None) -> None:
+        camera = booth.rig.cameras[name]
+        index = list(booth.rig.cameras).index(name)
+        self._rng = np.random.default_rng((booth.seed, index))
+        self._booth, self._camera = booth, camera
+        self.unit = SimulatedUnit.of(booth, name)
+        self._body = body
+        # One person, one sway: all cameras see the same phase.
+        self._sway_phase = float(np.random.default_rng((booth.seed, 7, 7)).random())
+        self._views: dict[float, TrueView] = {}
+
+    def frames(self, count: int) -> Iterator[VirtualFrame]:
+        """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
+        for sequence in range(count):
+            time_s = self.unit.phase_s + sequence / FRAME_RATE_HZ
+            raw = observe(self._view(time_s), self.unit.error, self._rng)
+            if self._rng.random() < self._booth.drop_rate:
+                continue
+            yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
+
+    def _view(self, time_s: float) -> TrueView:
+        """What a perfect sensor would see at a time, rendered once for each lean."""
+        booth, camera = self._booth, self._camera
+        turns = time_s / _SWAY_PERIOD_S + self._sway_phase
+        sway_m = 0.0 if self._body is None else booth.sway_m
+        lean_m = sway_m * float(np.sin(2.0 * np.pi * turns))
+        lean_m = _LEAN_STEP_M * round(lean_m / _LEAN_STEP_M)
+        if lean_m not in self._views:
+            pose = camera.world_from_camera
+            if camera.name in booth.moved_cameras:
+                pose = moved(pose, *booth.moved_cameras[camera.name])
+            meshes = booth.fixtures
+            if self._body is not None:
+                meshes.append(_leaning(self._body, lean_m))
+            if not meshes:
+                raise InputError("the virtual booth holds nothing to look at")
+            self._views[lean_m] = VirtualScene(meshes).view(camera, pose)
+        return self._views[lean_m]
+
+
+def _leaning(body: Mesh, lean_m: float) -> Mesh:
+    """Feet stay; the rest leans with height."""
+    share = np.clip(body.vertices[:, 2:] / 1.7, 0.0, 1.2) * (0.6, 0.8, 0.0)
+    return Mesh(body.vertices + share * lean_m, body.faces, body.dark)
+
+
+def render_bundle(
+    body: Mesh | None,
+    folder: Path,
+    booth: SimulatedBooth | None = None,
+    *,
+    frames: int = 10,
+    scan_id: str = "virtual",
+) -> Path:
+    """Write the scan bundle that a booth with this body in it would give."""
+    booth = booth or SimulatedBooth()
+    taken = {}
+    for name in booth.rig.cameras:
+        camera = VirtualCamera(booth, name, body)
+        taken[name] = [
+            CapturedFrame(TABLE[frame.raw], frame.ticks, TICK_HZ, frame.time_s, frame.sequence)
+            for frame in camera.frames(0 if name in booth.dead_cameras else frames)
+        ]
+    write_bundle(
+        folder,
+        scan_id=scan_id,
+        created="2026-01-01T00:00:00Z",
+        label="virtual",
+        depth_scale_m=DEPTH_SCALE_M,
+        rig=booth.rig,
+        frames=taken,
+        spread_s_max=1.0 / FRAME_RATE_HZ,
+    )
+    return folder
+
+
+def recorded_frames(camera: VirtualCamera, count: int) -> Iterator[RecordedFrame]:
+    """A camera's frames as a recording holds them."""
+    for frame in camera.frames(count):
+        yield RecordedFrame(frame.time_s, frame.ticks, frame.raw)
+
+
+class VirtualDriver:
+    """A simulated sensor in real time: a loop of frames is rendered once, then played."""
+
+    def __init__(self, name: str, body: Path, seed: int) -> None:
+        self._name, self._body, self._seed = name, body, seed
+        self._loop: list[VirtualFrame] = []
+        self._start_s = 0.0
+        self._sequence = 0
+
+    def open(self) -> DeviceInfo:
+        booth = SimulatedBooth(seed=self._seed)
+        if self._name not in booth.rig.cameras:
+            known = ", ".join(booth.rig.cameras)
+            raise DriverError(f"camera {self._name}: the virtual booth has only {known}")
+        camera = VirtualCamera(booth, self._name, load_mesh(self._body))
+        self._loop = list(camera.frames(_LIVE_LOOP_FRAMES))
+        self._unit = camera.unit
+        self._start_s = time.monotonic() + camera.unit.phase_s
+        self._sequence = 0
+        calibration = booth.rig.cameras[self._name]
+        return DeviceInfo(
+            serial=calibration.serial,
+            model="virtual",
+            width=calibration.width,
+            height=calibration.height,
+            K=calibration.K,
+            distortion=calibration.distortion,
+            depth_scale_m=DEPTH_SCALE_M,
+            tick_hz=TICK_HZ,
+            tick_bits=32,
+        )
+
+    def read(self, timeout_s: float) -> DepthFrame | None:
+        due_s = self._sequence / FRAME_RATE_HZ
+        wait_s = self._start_s + due_s - time.monotonic()
+        if wait_s > timeout_s:
+            time.sleep(timeout_s)
+            return None
+        time.sleep(max(wait_s, 0.0))
+        frame = self._loop[self._sequence % len(self._loop)]
+        ticks = self._unit.ticks(self._unit.phase_s + due_s)
+        result = DepthFrame(TABLE[frame.raw], ticks, time.monotonic(), self._sequence)
+        self._sequence += 1
+        return result
+
+    def close(self) -> None:
+        self._loop = []

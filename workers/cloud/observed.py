@@ -1,0 +1,72 @@
+"""What the cameras saw of a person: the merged cloud, each camera's image, and findings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.depth_image import Image
+from station.core.rig import CameraCalibration
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LEAST_POINTS = 1500
+"""Fewer points do not show a body."""
+POSSIBLE_HEIGHTS_M = (1.0, 2.6)
+"""A cloud that is lower or higher than this is not a standing person in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that the operator should know of."""
+
+    code: str
+    """"motion", "two-people", "camera-blind" or "frames-missing"."""
+    camera: str | None
+    value: float | None
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """One camera's cleaned image, (h, w) each."""
+
+    name: str
+    calibration: CameraCalibration
+    depth_m: Image
+    """Averaged, corrected, filtered; 0 = no reading."""
+    person: Mask
+    background: Mask
+    """Measured, and not the person."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """Points (n, 3) on the person in the world frame."""
+
+    points: Array
+    normals: Array
+    """(n, 3), unit, towards the camera."""
+    sigma_m: Array
+    """(n,): standard deviation along the ray."""
+    camera: NDArray[np.int16]
+    """(n,): index into camera_names."""
+    camera_names: tuple[str, ...]
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the origin of a bare cloud's points was in its own frame, turned z up."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class Preprocessed:
+    """What the fit works on."""
+
+    cloud: PointCloud
+    views: tuple[CameraView, ...]
+    """Empty for a bare cloud, else one of each of its cameras, in their order."""
+    findings: tuple[Finding, ...]

@@ -1,0 +1,277 @@
+"""A scan bundle's frames as one cloud of one person, with what else the cameras say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from station.core.bundle import Bundle
+from station.core.depth_image import Image, jumps
+from station.core.errors import InputError
+from station.core.lens import rays
+from station.core.rig import CameraCalibration
+from workers.cloud.average import average, random_sigma_m
+from workers.cloud.observed import CameraView, Finding, PointCloud, Preprocessed
+from workers.cloud.people import count_people
+from workers.cloud.points import normals, within
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BILATERAL_DIAMETER_PX = 7
+_BILATERAL_RANGE_SIGMAS = 2.5
+_BILATERAL_SPACE_PX = 2.0
+_MAX_INCIDENCE_COSINE = np.cos(np.radians(76.0))
+_VOXEL_M = 0.04
+_LEAST_POINTS = 2000
+_SECOND_PERSON_SHARE = 0.15
+_SECOND_PERSON_HEIGHT_M = 1.1
+"""A chair that stands apart harms nothing; another adult is another scan."""
+_PEOPLE_STRIDE = 4
+_MOTION_M = 0.010
+_MOTION_STRIDE = 4
+_LEAST_MOVING = 125
+"""Neighbours moved alike."""
+_UNSETTLED_SHARE = 0.25
+_PLENTY_OF_FRAMES = 10
+"""A scan that has so many lacks none, however long it took to get them."""
+_SIGMA_FLOOR_M = 4e-4
+"""What averaging more frames does not take away: quantisation, calibration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Volume:
+    """The part of the world in which the person is looked for, metres."""
+
+    min_m: tuple[float, float, float] = (-0.95, -0.75, 0.0)
+    max_m: tuple[float, float, float] = (0.95, 0.75, 2.2)
+    floor_clearance_m: float = 0.012
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) what the first scan would otherwise wait for."""
+    average(np.zeros((3, 2, 2), np.uint16), 1e-4)
+    nothing = np.zeros((1, 1, 3), np.float32)
+    # As `rays` gives them: what may be written to is another type, compiled apart.
+    nothing.flags.writeable = False
+    within(nothing, np.zeros((1, 1), np.float32), np.eye(4), np.zeros(3), np.zeros(3))
+    normals(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class _Camera:
+    """One camera's surface points inside the volume, flat."""
+
+    calibration: CameraCalibration
+    depth_m: Image
+    pixels: NDArray[np.int64]
+    points: Array
+    normals: Array
+    sigma_m: Array
+    change_m: Array
+    unsettled: float
+    """Share of the readings in the volume that do not agree over the frames."""
+    frames: int
+    ordered: int
+    """How many it would have been but for gaps in their sequence, where that is few."""
+
+
+def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
+    """Average, filter, crop and merge a bundle's frames.
+
+    Raises:
+        BundleError: a frame cannot be read.
+        InputError: there is nobody in the booth.
+    """
+    volume = volume or Volume()
+    names = [name for name, frames in bundle.frames.items() if frames]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        cameras = list(pool.map(lambda name: _camera(bundle, name, volume), names))
+        kept, findings = _one_person([camera.points for camera in cameras])
+        expected = max(max(camera.frames, camera.ordered) for camera in cameras)
+        cleaned = pool.map(_cleaned, cameras, kept)
+        noticed = pool.map(partial(_camera_findings, expected), names, cameras, kept)
+        views, clouds = zip(*cleaned, strict=True)
+        findings += [finding for of_camera in noticed for finding in of_camera]
+    findings += [
+        Finding("camera-blind", name, None, f"camera {name} gave no frame; check it")
+        for name in bundle.rig.cameras
+        if name not in names
+    ]
+    return Preprocessed(_merged(names, clouds), views, tuple(findings))
+
+
+def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
+    calibration = bundle.rig.cameras[name]
+    averaged = average(bundle.depth_stack(name), bundle.depth_scale_m)
+    depth = calibration.depth_correction.apply(averaged.depth_m).astype(np.float32)
+    near = _in_volume(calibration, depth, volume)
+    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    restless = _in_volume(calibration, averaged.unsettled_m, volume)
+    unsettled = float(restless.sum() / max(1, (near | restless).sum()))
+    if not len(rows):
+        nothing = np.empty((0, 3))
+        none = np.empty(0)
+        return _Camera(
+            calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
+            unsettled, len(bundle.frames[name]), _ordered(bundle, name),
+        )  # fmt: skip
+    # Everything from here on is done on the person's part of the image alone.
+    top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, depth.shape[0])
+    left, right = max(columns[0] - 8, 0), min(columns[-1] + 9, depth.shape[1])
+    window = np.s_[top:bottom, left:right]
+    part = np.ascontiguousarray(depth[window])
+    edge = jumps(part)
+    typical = float(np.median(part[near[window]]))
+    smooth: Image = cv2.bilateralFilter(
+        part,
+        _BILATERAL_DIAMETER_PX,
+        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical))),
+        _BILATERAL_SPACE_PX,
+    )  # type: ignore[assignment]  # the type of what it is given
+    smooth[part == 0] = 0.0
+    depth[window] = np.where(smooth > 0, smooth, part)
+    points = rays(calibration)[window] * smooth[..., None]
+    directions, valid = normals(points, smooth)
+    distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
+    cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
+    valid &= near[window] & ~edge & (cosine > _MAX_INCIDENCE_COSINE)
+    at = np.flatnonzero(valid)
+    y, x = np.unravel_index(at, valid.shape)
+    readings = averaged.count[window].ravel()[at].astype(np.float64)
+    sigma = random_sigma_m(smooth.ravel()[at].astype(np.float64))
+    sigma /= np.sqrt(readings * cosine.ravel()[at])
+    local = points.reshape(-1, 3)[at].astype(np.float64)
+    pose = calibration.world_from_camera
+    return _Camera(
+        calibration=calibration,
+        depth_m=depth,
+        pixels=(y + top) * depth.shape[1] + (x + left),
+        points=local @ pose[:3, :3].T + pose[:3, 3],
+        normals=directions.reshape(-1, 3)[at].astype(np.float64) @ pose[:3, :3].T,
+        sigma_m=np.hypot(sigma, _SIGMA_FLOOR_M),
+        change_m=averaged.change_m[window].ravel()[at].astype(np.float64),
+        unsettled=unsettled,
+        frames=len(bundle.frames[name]),
+        ordered=_ordered(bundle, name),
+    )
+
+
+def _ordered(bundle: Bundle, name: str) -> int:
+    numbers = [record.sequence for record in bundle.frames[name]]
+    return min(max(numbers) - min(numbers) + 1, _PLENTY_OF_FRAMES)
+
+
+def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -> Mask:
+    low = np.array(volume.min_m)
+    low[2] = max(low[2], volume.floor_clearance_m)
+    pose = calibration.world_from_camera
+    return within(rays(calibration), depth_m, pose, low, np.array(volume.max_m))
+
+
+def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
+    """The largest connected body in the booth; small pieces and furniture are left out."""
+    everything = np.concatenate(points)
+    if len(everything) < _LEAST_POINTS:
+        raise InputError(
+            "the booth is empty: the cameras see nobody in its volume; "
+            "ask the person to stand on the mark, or check volume in booth.toml"
+        )
+    # A coordinate a row: minima along long rows are quick.
+    rows = everything.T.copy()
+    low = rows.min(axis=1, keepdims=True) - 2 * _VOXEL_M
+    cells = ((rows - low) / _VOXEL_M).astype(np.int64)
+    shape = tuple(cells.max(axis=1) + 3)
+    cell = np.ravel_multi_index(tuple(cells), shape)
+    occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
+    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= 3))
+    of_point = labels.ravel()[cell]
+    sizes = np.bincount(of_point, minlength=count + 1)
+    sizes[0] = 0
+    main = int(np.argmax(sizes))
+    keep = of_point == main
+    beside = any(
+        sizes[label] > _SECOND_PERSON_SHARE * sizes[main]
+        and np.ptp(everything[of_point == label, 2]) > _SECOND_PERSON_HEIGHT_M
+        for label in range(1, count + 1)
+        if label != main
+    )
+    findings = []
+    if beside or count_people(everything[np.flatnonzero(keep)[::_PEOPLE_STRIDE]]) > 1:
+        message = "two people (or a large object) in the booth"
+        findings.append(Finding("two-people", None, None, message))
+    ends = np.cumsum([len(part) for part in points])
+    return np.split(keep, ends[:-1]), findings
+
+
+def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
+    person = np.zeros(camera.depth_m.shape, bool)
+    person.flat[camera.pixels[keep]] = True
+    # Pixels at the person's edge are neither: no reading there says what lies behind.
+    near_person = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    view = CameraView(
+        name=camera.calibration.name,
+        calibration=camera.calibration,
+        depth_m=camera.depth_m,
+        person=person,
+        background=(camera.depth_m > 0) & ~near_person,
+    )
+    return view, (camera.points[keep], camera.normals[keep], camera.sigma_m[keep])
+
+
+def _merged(names: list[str], clouds: Sequence[tuple[Array, Array, Array]]) -> PointCloud:
+    sizes = [len(points) for points, _, _ in clouds]
+    return PointCloud(
+        points=np.concatenate([points for points, _, _ in clouds]),
+        normals=np.concatenate([directions for _, directions, _ in clouds]),
+        sigma_m=np.concatenate([sigma for _, _, sigma in clouds]),
+        camera=np.repeat(np.arange(len(names), dtype=np.int16), sizes),
+        camera_names=tuple(names),
+    )
+
+
+def _camera_findings(expected: int, name: str, camera: _Camera, keep: Mask) -> list[Finding]:
+    found = []
+    if not keep.any():
+        message = f"camera {name} sees nothing of the person; check that it is not covered"
+        found.append(Finding("camera-blind", name, None, message))
+    if camera.frames < 0.5 * expected:
+        message = f"camera {name} gave {camera.frames} of {expected} frames; check its connection"
+        found.append(Finding("frames-missing", name, float(camera.frames), message))
+    moved_m = _motion(camera, keep)
+    if moved_m > _MOTION_M:
+        message = f"the person moved {1e3 * moved_m:.0f} mm between frames (camera {name})"
+        found.append(Finding("motion", name, moved_m, message))
+    elif camera.unsettled > _UNSETTLED_SHARE:
+        message = (
+            f"the person moved between frames: {100 * camera.unsettled:.0f} % of what camera "
+            f"{name} saw does not agree"
+        )
+        found.append(Finding("motion", name, None, message))
+    return found
+
+
+def _motion(camera: _Camera, keep: Mask) -> float:
+    """How far the person moved from the first third of the frames to the last, metres.
+
+    The depth changes are explained by one shift t: n . t = (n . ray) change, in least squares.
+    """
+    chosen = np.flatnonzero(keep & np.isfinite(camera.change_m))[::_MOTION_STRIDE]
+    if len(chosen) < _LEAST_MOVING:
+        return 0.0
+    pose = camera.calibration.world_from_camera
+    offsets = camera.points[chosen] - pose[:3, 3]
+    along = offsets / (offsets @ pose[:3, 2])[:, None]
+    directions = camera.normals[chosen]
+    shift = np.einsum("ni,ni->n", directions, along) * camera.change_m[chosen]
+    gate = 3.0 * np.median(np.abs(shift)) + 1e-4
+    used = np.abs(shift) < gate
+    normal = directions[used].T @ directions[used] + 1e-2 * used.sum() * np.eye(3)
+    return float(np.linalg.norm(np.linalg.solve(normal, directions[used].T @ shift[used])))

@@ -1,0 +1,162 @@
+"""Pictures of a fit's stages, drawn without a display: what --debug writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.files import private_folder
+from workers.pictures.render import (
+    BACKGROUND,
+    VIEWS,
+    Color,
+    Frame,
+    Picture,
+    Rendering,
+    Scene,
+    draw_line,
+    draw_points,
+    png,
+    write_text,
+)
+from workers.scape.fit.observer import Stage
+
+Array = NDArray[np.float64]
+
+_WIDTH, _HEIGHT = 430, 700
+_MARGIN = 1.08
+_TITLE_SIZE = 18
+_TITLE_AT = (14, 26)
+_POINT = np.array([170, 90, 20], np.uint8)
+_PAIR_NEAR, _PAIR_FAR = np.array([60.0, 160.0, 40.0]), np.array([40.0, 40.0, 220.0])
+_FAR_PAIR_M = 0.05
+_PAIRS_SHOWN = 2500
+_POINTS_SHOWN = 30_000
+_WORST_SHOWN_M = 0.003
+_OUTSIDE, _INSIDE = np.array([60.0, 60.0, 235.0]), np.array([235.0, 120.0, 50.0])
+_MET, _UNSEEN = np.array([225.0, 235.0, 225.0]), np.array([150.0, 150.0, 150.0])
+_CLOSE_M = 0.01
+_BARE_DARK, _BARE_LIGHT = 60.0, 200.0
+_BODY_STAGES = {
+    "start": (2, "start"),
+    "joint": (4, "model fitted (pose and shape)"),
+    "done": (6, "result"),
+}
+"""Stages that are drawn as the body with the cloud over it: number and title."""
+
+
+class DebugPictures:
+    """An observer of a fit that draws each stage from the front, the side and the back.
+
+    Files in `folder`, in the order of the fit: 1-cloud.png, 2-start.png,
+    3-correspondences-NN.png, 4-joint.png, 5-surface.png (an error map), 6-done.png.
+    """
+
+    def __init__(self, folder: Path, faces: NDArray[np.int32]) -> None:
+        self._folder = private_folder(folder)
+        self._faces = faces
+        self._rounds = 0
+        self._points: Array = np.empty((0, 3))
+        self._normals: Array = np.empty((0, 3))
+
+    def __call__(self, stage: Stage, arrays: Mapping[str, NDArray[Any]]) -> None:
+        if stage == "cloud":
+            self._points, self._normals = arrays["points"].copy(), arrays["normals"].copy()
+            self._write("1-cloud", f"cloud: {len(self._points):,} points", self._bare)
+            return
+        scene = Scene(arrays["vertices"], self._faces)
+        if stage == "correspondences":
+            self._draw_pairs(scene, arrays["on_body"], arrays["on_cloud"])
+        elif stage == "surface":
+            self._draw_errors(scene, arrays["residual_m"])
+        else:
+            number, title = _BODY_STAGES[stage]
+            self._write(f"{number}-{stage}", title, lambda frame: self._over(scene, frame))
+
+    def _draw_pairs(self, scene: Scene, on_body: Array, on_cloud: Array) -> None:
+        self._rounds += 1
+        away = np.linalg.norm(on_cloud - on_body, axis=1)
+        middle_mm = 1e3 * float(np.median(away)) if len(away) else float("nan")
+        title = f"round {self._rounds}: {len(away):,} pairs, median {middle_mm:.1f} mm"
+        name = f"3-correspondences-{self._rounds:02d}"
+        self._write(name, title, lambda frame: _paired(scene, on_body, on_cloud, frame))
+
+    def _draw_errors(self, scene: Scene, residual_m: Array) -> None:
+        seen = residual_m[np.isfinite(residual_m)]
+        rms_mm = 1e3 * float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
+        limit = f"{1e3 * _WORST_SHOWN_M:.0f} mm"
+        title = f"error: rms {rms_mm:.2f} mm; red: points {limit} outside, blue: inside, grey: none"
+        colors = self._error_colors(residual_m)
+        self._write("5-surface", title, lambda frame: scene.render(frame, colors).picture)
+
+    def _frame(self, view: str) -> Frame:
+        low, high = np.quantile(self._points, [0.001, 0.999], axis=0)
+        extent = high - low
+        across = max(extent[0], extent[1])
+        scale = _MARGIN * max(extent[2] / (_HEIGHT - 60), across / _WIDTH)
+        x, y, z = (float(value) for value in 0.5 * (low + high))
+        return Frame(view, _WIDTH, _HEIGHT, float(scale), (x, y, z + 15.0 * float(scale)))
+
+    def _write(self, name: str, title: str, draw: Callable[[Frame], Picture]) -> None:
+        picture = np.concatenate([draw(self._frame(view)) for view in VIEWS], axis=1)
+        write_text(picture, title, _TITLE_AT, size=_TITLE_SIZE)
+        (self._folder / f"{name}.png").write_bytes(png(picture))
+
+    def _bare(self, frame: Frame) -> Picture:
+        """The points that face the camera, shaded by their normals."""
+        picture = np.full((_HEIGHT, _WIDTH, 3), BACKGROUND, np.uint8)
+        facing = -(self._normals @ frame.forward)
+        shown = np.flatnonzero(facing > 0.0)
+        shown = shown[np.argsort(-frame.depths(self._points[shown]))]
+        grey = _BARE_DARK + (_BARE_LIGHT - _BARE_DARK) * facing[shown]
+        colors = np.repeat(grey[:, None], 3, axis=1).astype(np.uint8)
+        draw_points(picture, frame.pixels(self._points[shown]), colors)
+        return picture
+
+    def _over(self, scene: Scene, frame: Frame) -> Picture:
+        """The body, and the points that it does not hide."""
+        shown = scene.render(frame)
+        facing = self._normals @ frame.forward < 0.0
+        visible = np.flatnonzero(facing & _in_sight(self._points, frame, shown))
+        thinned = visible[:: max(1, len(visible) // _POINTS_SHOWN)]
+        draw_points(shown.picture, frame.pixels(self._points[thinned]), _POINT)
+        return shown.picture
+
+    def _error_colors(self, residual_m: Array) -> Array:
+        """(K, 3): how far the points lie outside (red) or inside (blue) of each triangle."""
+        known = np.isfinite(residual_m)
+        value = np.where(known, residual_m, 0.0)[self._faces]
+        count = known[self._faces].sum(axis=1)
+        mean = value.sum(axis=1) / np.maximum(count, 1)
+        share = np.clip(np.abs(mean) / _WORST_SHOWN_M, 0.0, 1.0)[:, None]
+        side = np.where((mean > 0.0)[:, None], _OUTSIDE, _INSIDE)
+        colors = (1.0 - share) * _MET + share * side
+        colors[count == 0] = _UNSEEN
+        return np.asarray(colors)
+
+
+def _paired(scene: Scene, on_body: Array, on_cloud: Array, frame: Frame) -> Picture:
+    """The body, and lines from it to the points that pull it: green near, red far."""
+    shown = scene.render(frame)
+    visible = np.flatnonzero(_in_sight(on_body, frame, shown))
+    some = visible[:: max(1, len(visible) // _PAIRS_SHOWN)]
+    starts, ends = frame.pixels(on_body[some]), frame.pixels(on_cloud[some])
+    away = np.linalg.norm(on_cloud[some] - on_body[some], axis=1, keepdims=True)
+    share = np.clip(away / _FAR_PAIR_M, 0.0, 1.0)
+    colors = (1.0 - share) * _PAIR_NEAR + share * _PAIR_FAR
+    for start, end, (blue, green, red) in zip(starts, ends, colors.astype(int), strict=True):
+        color: Color = (int(blue), int(green), int(red))
+        draw_line(shown.picture, np.stack([start, end]), color, thickness=1)
+    draw_points(shown.picture, ends, colors.astype(np.uint8))
+    return shown.picture
+
+
+def _in_sight(points: Array, frame: Frame, shown: Rendering) -> NDArray[np.bool_]:
+    """(n,): points that the body does not hide."""
+    u, v = np.rint(frame.pixels(points)).astype(int).T
+    depth = shown.depth_m[np.clip(v, 0, frame.height - 1), np.clip(u, 0, frame.width - 1)]
+    return np.asarray(frame.depths(points) < depth + _CLOSE_M)

@@ -1,0 +1,97 @@
+"""`reconstruct fit`: one bundle or cloud, without a station."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import get_args
+
+import click
+
+from station.core.errors import InputError
+from station.core.files import publish_folder
+from workers.scape.fit.fit import Method
+
+
+@click.command()
+@click.argument("bundle", type=click.Path(path_type=Path), required=False)
+@click.option("--cloud", type=click.Path(path_type=Path), help="a point cloud, .ply or .pcd")
+@click.option("--up", type=click.Choice(["z", "y"]), default="z", show_default=True, help="of it")
+@click.option(
+    "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="new folder"
+)
+@click.option("--method", type=click.Choice(get_args(Method)), default="joint", show_default=True)
+@click.option(
+    "--debug",
+    "debug_folder",
+    type=click.Path(path_type=Path),
+    help="folder for pictures of every stage: cloud, pairs, body over cloud, error map",
+)
+@click.option("--quiet", is_flag=True, help="no progress")
+def fit(
+    bundle: Path | None,
+    cloud: Path | None,
+    up: str,
+    out_folder: Path,
+    method: Method,
+    debug_folder: Path | None,
+    quiet: bool,
+) -> None:
+    """Reconstruct a scan bundle, or a point cloud from any scanner.
+
+    Exit code 0 for a result (also one that says "rescan"); 1 for input that cannot be used.
+
+    \b
+    Examples:
+      reconstruct fit spool/done/20261121T100000Z-7f3a --out result
+      reconstruct fit --cloud body.ply --up y --out result
+      reconstruct fit BUNDLE --out result --debug pictures
+    """
+    if (bundle is None) == (cloud is None):
+        raise click.UsageError("give a bundle or --cloud FILE: one of them")
+    if out_folder.exists():
+        raise InputError(f"{out_folder} exists already; name a new folder with --out")
+    if debug_folder is not None and debug_folder.exists() and not debug_folder.is_dir():
+        raise InputError(f"{debug_folder} is not a folder; name one for the pictures with --debug")
+    from workers.cloud.bare import read_cloud
+    from workers.reconstruct import job
+    from workers.scape.fit.observer import Observer, unobserved
+    from workers.scape.model.body_model import load_model
+
+    model = None
+    observer: Observer = unobserved
+    if debug_folder is not None:
+        from workers.pictures.debug_pictures import DebugPictures
+
+        model = load_model()
+        observer = DebugPictures(debug_folder, model.faces)
+
+    def show(step: str, share: float) -> None:
+        if not quiet:
+            click.echo(f"{step} {100 * share:3.0f} %", err=True)
+
+    out_folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=".fit-", dir=out_folder.parent))
+    try:
+        if bundle is not None:
+            summary = job.reconstruct_bundle(
+                bundle, temporary, method=method, model=model, progress=show, observer=observer
+            )
+        else:
+            assert cloud is not None
+            summary = job.reconstruct_cloud(
+                read_cloud(cloud, up),
+                cloud.stem,
+                temporary,
+                method=method,
+                model=model,
+                progress=show,
+                observer=observer,
+            )
+        publish_folder(temporary, out_folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    click.echo(f"{out_folder}: {summary.status}")
+    for reason in summary.reasons:
+        click.echo(f"  {reason}")

@@ -1,0 +1,159 @@
+"""One scan, bundle to result, readable as the paper's steps.
+
+Zhou, Pan, Tong, Liu & Pan, "Fast 3D Human Body Reconstruction from Kinects" (2013): merge and
+filter the depth images, fit the SCAPE model to them, measure the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from station.core.bundle import read_bundle
+from workers.cloud.observed import PointCloud, Preprocessed
+from workers.cloud.preprocess import Volume, preprocess
+from workers.cloud.preprocess import warm_up as compile_preprocessing
+from workers.export.meshes import obj_mesh
+from workers.export.preview import preview
+from workers.export.result import write_result
+from workers.export.stopwatch import Stopwatch
+from workers.measure.body import MeasuredBody, measure_body, measure_standing
+from workers.scape.evidence.cameras import CameraCorrections
+from workers.scape.fit.fit import (
+    LaidBody,
+    Method,
+    fit_body,
+    lay_body,
+    one_thread_in_blas,
+    take_apart,
+)
+from workers.scape.fit.observer import Observer, unobserved
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.skeleton import joint_positions
+
+Progress = Callable[[str, float], None]
+"""Called with the step's name and the share of it that is done, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobSummary:
+    """What an operator has to know of a result."""
+
+    status: str
+    """"ok" or "rescan"."""
+    reasons: tuple[str, ...]
+
+
+def warm_up() -> BodyModel:
+    """Load everything that the first job would otherwise wait for."""
+    model = load_model()
+    compile_preprocessing()
+    cloud = _mean_cloud(model)
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    # A bare cloud has no cameras that could be off.
+    CameraCorrections(np.zeros((1, 3)), np.eye(6)[None], np.ones((1, 6))).corrected(cloud)
+    joint_positions(model, model.mean, model.neutral_state().rotations)
+    obj_mesh(model.mean, model)
+    measured = measure_body(model, model.mean)
+    preview(model.mean, model.faces, measured.rows, fit.verdict)
+    return model
+
+
+def _mean_cloud(model: BodyModel) -> PointCloud:
+    """The mean body as a scanner would give it."""
+    count = model.vertex_count
+    return PointCloud(
+        model.mean,
+        vertex_normals(model.mean, model.faces),
+        np.full(count, 1e-3),
+        np.zeros(count, np.int16),
+        ("mean",),
+    )
+
+
+def reconstruct_bundle(
+    bundle_folder: Path,
+    out_folder: Path,
+    *,
+    method: Method = "joint",
+    model: BodyModel | None = None,
+    volume: Volume | None = None,
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
+) -> JobSummary:
+    """Reconstruct a scan bundle into a folder that exists and is empty.
+
+    Raises:
+        BoothError: the bundle cannot be used; one line says why.
+    """
+    watch = Stopwatch()
+    progress("loading", 0.0)
+    with watch.step("load"):
+        bundle = read_bundle(bundle_folder)
+        model = model or load_model()
+    progress("filtering", 0.0)
+    with watch.step("preprocess"):
+        scan = preprocess(bundle, volume)
+    return _fitted(model, scan, bundle.scan_id, method, out_folder, watch, progress, observer)
+
+
+def reconstruct_cloud(
+    cloud: PointCloud,
+    scan_id: str,
+    out_folder: Path,
+    *,
+    method: Method = "joint",
+    model: BodyModel | None = None,
+    progress: Progress = lambda step, share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
+) -> JobSummary:
+    """Reconstruct a bare cloud, from any scanner."""
+    watch = Stopwatch()
+    with watch.step("load"):
+        model = model or load_model()
+    with watch.step("preprocess"):
+        scan = Preprocessed(cloud, (), ())
+    return _fitted(model, scan, scan_id, method, out_folder, watch, progress, observer)
+
+
+def _fitted(
+    model: BodyModel,
+    scan: Preprocessed,
+    scan_id: str,
+    method: Method,
+    out_folder: Path,
+    watch: Stopwatch,
+    progress: Progress,
+    observer: Observer,
+) -> JobSummary:
+    """Fit, measure, write."""
+    with one_thread_in_blas():
+        laid = lay_body(model, scan, method, progress, observer)
+        progress("measuring", 0.0)
+        # Neither needs what the other finds.
+        with ThreadPoolExecutor(1) as beside:
+            measuring = beside.submit(_measured, model, laid, watch)
+            fit = take_apart(model, laid, scan.findings, observer)
+            measured, standing = measuring.result()
+        watch.seconds.update(fit.seconds)
+        progress("writing", 0.0)
+        write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
+    progress("done", 1.0)
+    return JobSummary(fit.verdict.status, fit.verdict.reasons)
+
+
+def _measured(
+    model: BodyModel, laid: LaidBody, watch: Stopwatch
+) -> tuple[MeasuredBody, MeasuredBody]:
+    """As scanned, and in the standard standing pose."""
+    with watch.step("measure"):
+        sigma_m = laid.surface.sigma_m
+        return (
+            measure_body(model, laid.vertices, sigma_m),
+            measure_standing(model, laid.vertices, laid.state, sigma_m),
+        )

@@ -1,0 +1,127 @@
+"""`reconstruct measure`: the table of a result, or of a mesh in the template's topology."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from station.core.errors import FormatError, InputError
+
+_DIGITS = 5
+"""Of a table: hundredths of a millimetre, far below any interval."""
+
+
+@click.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="for programs")
+@click.option("--csv", "as_csv", is_flag=True, help="for spreadsheets")
+@click.option(
+    "--pose",
+    type=click.Choice(["as-scanned", "standard"]),
+    default="as-scanned",
+    show_default=True,
+    help="as the person stood, or in the standard standing pose",
+)
+@click.option("--up", type=click.Choice(["z", "y"]), default="z", help="a mesh's upward axis")
+def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> None:
+    """Print the measurements of a result folder, or measure a mesh in the template's topology.
+
+    A mesh (metres, soles on the floor) needs no fit; it counts as exact, so its intervals have no
+    width.
+
+    \b
+    Examples:
+      reconstruct measure spool/outbox/20261121T100000Z-7f3a
+      reconstruct measure result --pose standard --csv > standard.csv
+      reconstruct measure mesh.ply --json
+    """
+    if as_json and as_csv:
+        raise click.UsageError("--json or --csv, not both")
+    document = _of_result(source, pose) if source.is_dir() else _of_mesh(source, pose, up)
+    if as_json:
+        click.echo(json.dumps(document))
+    elif as_csv:
+        _write_csv(document)
+    else:
+        _print_table(document)
+
+
+def _of_result(folder: Path, pose: str) -> dict[str, Any]:
+    name = "measurements.json" if pose == "as-scanned" else "measurements-standard.json"
+    path = folder / name
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder} has no {name}; give a result folder, or measure its mesh: "
+            f"reconstruct measure {folder / 'mesh.ply'} --pose {pose}"
+        ) from None
+    except ValueError as cause:
+        raise FormatError(f"{path} is damaged ({cause}); fit the scan again") from None
+    if (
+        not isinstance(document, dict)
+        or document.get("format") != "booth-measurements"
+        or document.get("version") != 1
+    ):
+        raise FormatError(f"{path} is not booth-measurements version 1; fit the scan again")
+    return document
+
+
+def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
+    from workers.cloud.bare import read_template_mesh
+    from workers.export.result import measurements_document
+    from workers.measure.body import measure_body, measure_standing
+    from workers.scape.model.body_model import load_model
+
+    model = load_model()
+    vertices = read_template_mesh(path, model.faces, up)
+    if pose == "as-scanned":
+        return measurements_document(path.stem, measure_body(model, vertices))
+    state = model.project(vertices)
+    return measurements_document(path.stem, measure_standing(model, vertices, state))
+
+
+def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    return [
+        (name, unit, document[f"{name}_{unit}"])
+        for name, unit in (("volume", "m3"), ("surface", "m2"))
+        if f"{name}_{unit}" in document
+    ]
+
+
+def _write_csv(document: dict[str, Any]) -> None:
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(["name", "value", "low", "high", "unit", "standard"])
+    for row in document["measurements"]:
+        numbers = (round(number, _DIGITS) for number in (row["value_m"], *row["interval95_m"]))
+        writer.writerow([row["name"], *numbers, "m", row["standard"]])
+    for name, unit, content in _contents(document):
+        numbers = (round(number, _DIGITS) for number in (content["value"], *content["interval95"]))
+        writer.writerow([name, *numbers, unit, ""])
+
+
+def _print_table(document: dict[str, Any]) -> None:
+    from workers.measure.definitions import DEFINITIONS
+
+    words = {definition.name: definition.words for definition in DEFINITIONS}
+    click.echo(f"{document['scan_id']}, pose {document['pose']}: values with 95 % intervals")
+    for row in document["measurements"]:
+        low, high = row["interval95_m"]
+        span = f"{100 * low:6.1f} to {100 * high:5.1f}" if high > low else ""
+        click.echo(
+            f"{row['name']:<27}{100 * row['value_m']:7.1f} cm  {span:<16}"
+            f"{words.get(row['name'], '')}{_in_brackets(row['standard'])}"
+        )
+    for name, unit, content in _contents(document):
+        low, high = content["interval95"]
+        span = f"{low:6.4f} to {high:6.4f}" if high > low else ""
+        click.echo(f"{name:<27}{content['value']:7.4f} {unit}  {span}")
+
+
+def _in_brackets(standard: str) -> str:
+    return f" ({standard})" if standard else ""

@@ -1,0 +1,114 @@
+"""Where hands end: the rim of what a camera saw before the booth.
+
+Readings beside a silhouette have no normal, so the cloud of a finger is thin and ends a centimetre
+short of the tip. But they say where the silhouette is, and there the skin turns away from the
+camera: its normal is square to the ray and to the outline (the contour generator of Cipolla &
+Blake 1992). A place and a normal are all that the fit needs to know of a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.geometry import invert, transform
+from station.core.lens import project, rays
+from station.core.rig import CameraCalibration
+from workers.cloud.observed import CameraView, PointCloud
+
+Array = NDArray[np.float64]
+
+_AROUND_PX = 14
+_AROUND_M = 0.03
+"""How far from the body, as it lies so far, readings may be of it: in the image, and in depth."""
+_BEHIND_M = 0.04
+"""How much farther what lies behind a rim must be."""
+_GAP_PX = 2
+"""At an edge readings vanish; so near to it there must be one of what lies behind."""
+_SMOOTH_PX = 1.0
+_LEAST_SLOPE = 0.12
+"""Of the smoothed silhouette, per pixel: a straight edge has three times that, a slit between
+fingers none, and no direction."""
+_LATERAL_PX = 0.8
+"""Standard deviation of an edge in the image (Nguyen, Izadi & Lovell 2012)."""
+
+
+def rims_of(
+    views: Sequence[CameraView], camera_names: tuple[str, ...], bodies: Sequence[Array]
+) -> PointCloud:
+    """In all views, of bodies of which vertices (m, 3) are known by a few centimetres.
+
+    The normals look outwards, square to the rays; sigma_m is that along them.
+    """
+    nothing = np.empty((0, 3))
+    rims, cameras = [(nothing, nothing, np.empty(0))], [0]
+    for view in views:
+        for vertices in bodies:
+            rims.append(_rim(view, vertices))
+            cameras.append(camera_names.index(view.name))
+    points, normals, sigma_m = (np.concatenate(pieces) for pieces in zip(*rims, strict=True))
+    camera = np.repeat(np.array(cameras, np.int16), [len(points) for points, _, _ in rims])
+    return PointCloud(points, normals, sigma_m, camera, camera_names)
+
+
+def _rim(view: CameraView, vertices: Array) -> tuple[Array, Array, Array]:
+    """Points (n, 3), normals (n, 3) and standard deviations (n,) in one view."""
+    local = transform(invert(view.calibration.world_from_camera), vertices)
+    corner, depth = _window(view, local)
+    if not depth.size:
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+    nearest, farthest = local[:, 2].min() - _AROUND_M, local[:, 2].max() + _AROUND_M
+    # What is nearer than the body hides its rim: it counts as inside, and its own rim is left out.
+    inside = ((depth > 0) & (depth < farthest)).astype(np.uint8)
+    edge = (inside > cv2.erode(inside, _square(1))) & (depth > nearest)
+    edge &= cv2.dilate(depth, _square(_GAP_PX)) - depth > _BEHIND_M
+    smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _SMOOTH_PX)
+    slope_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    slope_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    y, x = np.nonzero(edge)
+    outwards = -np.stack([slope_u[y, x], slope_v[y, x]], axis=1).astype(np.float64)
+    steep = np.linalg.norm(outwards, axis=1)
+    kept = steep > _LEAST_SLOPE
+    y, x, outwards = y[kept], x[kept], outwards[kept] / steep[kept, None]
+    return _lifted(view.calibration, (x, y) + corner[:, None], outwards, depth[y, x])
+
+
+def _square(reach_px: int) -> NDArray[np.uint8]:
+    return np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+
+
+def _window(view: CameraView, local: Array) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Corner (u, v) and depths of the image around vertices (m, 3) in the camera's frame; nothing
+    where one is behind the camera."""
+    pixels = project(view.calibration, local)
+    if np.isnan(pixels).any():
+        return np.zeros(2, np.intp), view.depth_m[:0]
+    height, width = view.depth_m.shape
+    around = np.stack([pixels.min(axis=0) - _AROUND_PX, pixels.max(axis=0) + _AROUND_PX])
+    (left, top), (right, bottom) = np.clip(around, 0, (width, height)).astype(np.intp)
+    return np.array([left, top]), view.depth_m[top:bottom, left:right]
+
+
+def _lifted(
+    calibration: CameraCalibration,
+    pixels: NDArray[np.intp],
+    outwards: Array,
+    depth_m: NDArray[np.float32],
+) -> tuple[Array, Array, Array]:
+    """Edge pixels (2, n) and the outline's normals (n, 2) there as oriented points of the world."""
+    focal = np.diag(calibration.K)[:2]
+    ray = rays(calibration)[pixels[1], pixels[0]].astype(np.float64)
+    # The edge runs along the pixel's outer border.
+    ray[:, :2] += 0.5 * outwards / focal
+    across = outwards * focal
+    normals = np.column_stack([across, -np.einsum("ni,ni->n", across, ray[:, :2])])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    pose, z = calibration.world_from_camera, depth_m.astype(np.float64)
+    return (
+        (ray * z[:, None]) @ pose[:3, :3].T + pose[:3, 3],
+        normals @ pose[:3, :3].T,
+        _LATERAL_PX * z / focal[0],
+    )

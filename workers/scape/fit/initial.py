@@ -1,0 +1,163 @@
+"""Where the fit starts: height, place, heading and arms from coarse features of the cloud."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.kernels import trimmed_costs
+from workers.scape.model.sampled import SampledBody
+
+Array = NDArray[np.float64]
+
+_NEUTRAL_ARM_DEG = 43.0
+_ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
+_HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+_AROUND_DEG = tuple(float(turn) for turn in range(-180, 180, 24))
+_FEW_ARMS_DEG = (12.0, 39.0, 66.0)
+_FACING_DEG = 36.0
+"""Who is turned by less faces the booth's front."""
+_FEET, _ANKLES = 0.04, (0.06, 0.12)
+"""Up to and between which shares of the stature."""
+_TOES_M = 0.01
+"""How far feet reach ahead of their ankles, at the least."""
+_SWINGS_DEG = (-25.0, 0.0, 25.0)
+_STRAIGHTER_ELBOW_RAD = np.radians(22.0)
+_CLOUD_TRIM_M = 0.48
+"""Points of an arm that hangs at the wrong angle must tell: a hand is off by that much."""
+_BODY_TRIM_M = 0.08
+_STATURE_COMPONENTS = 40
+"""The first ones hold nearly all of it, and fewer are quicker to evaluate."""
+
+_Try = tuple[tuple[float, float], tuple[float, float], float]
+"""Degrees: of the arms from the trunk and of their swing back (left, right), of the heading."""
+
+
+def posed(
+    model: BodyModel,
+    state: BodyState,
+    arm_deg: tuple[float, float],
+    swing_deg: tuple[float, float],
+    heading_deg: float,
+) -> BodyState:
+    """A state with arms (left, right) so many degrees from the trunk and so many behind it, turned
+    about the vertical."""
+    names = list(model.part_names)
+    twists = np.zeros((model.part_count, 3))
+    twists[0, 2] = np.radians(heading_deg)
+    for side, sign, angle, swing in zip(
+        ("left", "right"), (1.0, -1.0), arm_deg, swing_deg, strict=True
+    ):
+        lower = sign * np.radians(_NEUTRAL_ARM_DEG - angle)
+        twists[names.index(f"shoulder_{side}"), 1] = 0.15 * lower
+        twists[names.index(f"upper_arm_{side}"), 0] = np.radians(swing)
+        twists[names.index(f"upper_arm_{side}"), 1] = 0.85 * lower
+        straighter = np.array([0.7, 0.1 * sign, 0.7 * sign]) * _STRAIGHTER_ELBOW_RAD
+        twists[names.index(f"forearm_{side}")] = straighter
+    return replace(state, rotations=model.absolute_rotations(twists))
+
+
+def stature_beta(model: BodyModel, stature_m: float) -> Array:
+    """The likeliest shape of a stature: the smallest beta that gives it (conditional normal)."""
+    top = model.landmarks["crown"]
+    sole = int(np.argmin(model.mean[:, 2]))
+    gradient = (model.directions[:, top, 2] - model.directions[:, sole, 2]).astype(np.float64)
+    gradient[_STATURE_COMPONENTS:] = 0.0
+    excess = stature_m - float(model.mean[top, 2] - model.mean[sole, 2])
+    beta = gradient * excess / float(gradient @ gradient)
+    norm = float(np.linalg.norm(beta))
+    return beta * min(1.0, 3.5 / max(norm, 1e-9))
+
+
+def starting_states(
+    model: BodyModel, scout: SampledBody, points: Array, cloud: Array
+) -> list[BodyState]:
+    """States to start from, best first, judged on a coarse sample (n, 3) of a cloud (m, 3).
+
+    First where the person roughly looks; then both arms at one angle and all headings about that,
+    then each arm alone at the best heading, then each arm swung forward and back.
+    """
+    stature = float(np.quantile(points[:, 2], 0.9995))
+    state = replace(model.neutral_state(), beta=stature_beta(model, stature))
+    trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
+    center = np.median(trunk if len(trunk) > 50 else points, axis=0)
+    # What bends the surface a little with the pose is left out here.
+    arms, _ = scout.arms(state, ())
+
+    def scored(tried: list[_Try]) -> tuple[Array, list[BodyState]]:
+        states = [posed(model, state, *one) for one in tried]
+        bodies, states = _placed(model, scout, arms, states, center)
+        return _costs(bodies, points), states
+
+    straight = (0.0, 0.0)
+    around = [((arm, arm), straight, turn) for arm, turn in product(_FEW_ARMS_DEG, _AROUND_DEG)]
+    roughly = around[int(np.argmin(scored(around)[0]))][2]
+    facing = facing_deg(roughly, cloud, stature)
+    together = [
+        ((arm, arm), straight, facing + turn) for arm, turn in product(_ARMS_DEG, _HEADINGS_DEG)
+    ]
+    heading = together[int(np.argmin(scored(together)[0]))][2]
+    apart = [(arms_deg, straight, heading) for arms_deg in product(_ARMS_DEG, _ARMS_DEG)]
+    costs, states = scored(apart)
+    arms_deg = apart[int(np.argmin(costs))][0]
+    swung = [(arms_deg, swing, heading) for swing in product(_SWINGS_DEG, _SWINGS_DEG)]
+    more_costs, more_states = scored([one for one in swung if any(one[1])])
+    costs, states = np.concatenate([costs, more_costs]), states + more_states
+    return [states[index] for index in np.argsort(costs, kind="stable")]
+
+
+def facing_deg(heading_deg: float, cloud: Array, stature_m: float) -> float:
+    """A heading or its opposite, which a coarse body can hardly tell apart: toes point ahead.
+
+    Args:
+        heading_deg: about z from -y.
+        cloud: (m, 3), standing on z = 0.
+    """
+    height = cloud[:, 2] / stature_m
+    feet = cloud[height < _FEET, :2]
+    ankles = cloud[(height > _ANKLES[0]) & (height < _ANKLES[1]), :2]
+    turn = np.radians(heading_deg)
+    ahead = 0.0
+    if len(feet) and len(ankles):
+        own = cKDTree(ankles).query(feet)[1]
+        ahead = float((feet - ankles[own]).mean(axis=0) @ (np.sin(turn), -np.cos(turn)))
+    # Feet that do not tell leave the booth's front.
+    away = ahead < 0.0 if abs(ahead) > _TOES_M else np.cos(turn) < 0.0
+    facing = (heading_deg + (360.0 if away else 180.0)) % 360.0 - 180.0
+    return 0.0 if abs(facing) < _FACING_DEG else facing
+
+
+def _placed(
+    model: BodyModel,
+    scout: SampledBody,
+    arms: NDArray[np.float32],
+    states: list[BodyState],
+    center: Array,
+) -> tuple[Array, list[BodyState]]:
+    """Bodies (c, n, 3) over the cloud's center with their soles on the floor, and their states."""
+    rotations = np.stack([state.rotations for state in states])
+    bodies = np.einsum("cpij,npj->cni", rotations, arms.astype(np.float64), optimize=True)
+    trunk = np.isin(model.part_of_vertex[scout.indices], (0, 1, 2))
+    shift = center - np.median(bodies[:, trunk], axis=1)
+    shift[:, 2] = -bodies[:, :, 2].min(axis=1)
+    placed = [
+        replace(state, translation=offset) for state, offset in zip(states, shift, strict=True)
+    ]
+    return bodies + shift[:, None], placed
+
+
+def _costs(bodies: Array, points: Array) -> Array:
+    """Trimmed two-way distances: the cloud must be explained, the body need not all be seen."""
+    found = trimmed_costs(
+        np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
+        points.astype(np.float32),
+        _CLOUD_TRIM_M,
+        _BODY_TRIM_M,
+        1.0,
+    )
+    return np.asarray(found)

@@ -1,0 +1,114 @@
+"""The paper's algorithm as it stands (Zhou et al. 2013), for comparison.
+
+Iterate until Y' stops changing: (a) correspondences and rigid alignment until the pairs settle,
+(b) pose and shape by SCAPE's quadratic energies in turn, (c) the mesh that minimises
+E(Y') = sum_p |M(p) - Y'(p)|^2 + w sum_i |Y'(p_i) - T(q_i)|^2 with w = 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.errors import InputError
+from station.core.geometry import rigid_fit, transform
+from workers.scape.evidence.correspondence import compatible
+from workers.scape.fit.observer import Observer, unobserved
+from workers.scape.fit.pull import Target
+from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.surface.displacement import SurfaceFit
+
+Array = NDArray[np.float64]
+
+MAX_CORRESPONDENCE_DISTANCE_M = 0.05
+MAX_NORMAL_ANGLE_RAD = np.radians(15.0)
+SURFACE_WEIGHT = 1.0
+_MOST_ITERATIONS = 10
+_MOST_ALIGNMENTS = 20
+_SETTLED_M = 5e-4
+_LEAST_PAIRS = 50
+_SHAPE_RIDGE = 1e-3
+
+Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Vertices and the points that they belong to."""
+
+
+def fit_like_the_paper(
+    model: BodyModel,
+    target: Target,
+    state: BodyState,
+    progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
+    observer: Observer = unobserved,
+) -> tuple[SurfaceFit, BodyState, int]:
+    """The paper's loop; returns the surface, the last state and how often it went round."""
+    mesh = model.vertices(state)
+    iteration = 0
+    for iteration in range(1, _MOST_ITERATIONS + 1):
+        mesh, pairs = align_rigidly(model, target, mesh)
+        on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
+        observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
+        state = solve_pose_and_shape(model, mesh, pairs, target)
+        moved = solve_mesh(model.vertices(state), pairs, target)
+        change_m = float(np.sqrt(np.mean(np.sum((moved - mesh) ** 2, axis=1))))
+        mesh = moved
+        progress(iteration / _MOST_ITERATIONS)
+        if change_m < _SETTLED_M:
+            break
+    seen = np.zeros(len(mesh), bool)
+    vertex, point = find_pairs(model, target, mesh)
+    seen[vertex] = True
+    normals = vertex_normals(mesh, model.faces)
+    residual = np.full(len(mesh), np.nan)
+    residual[vertex] = np.einsum(
+        "ni,ni->n", normals[vertex], target.tree.points[point] - mesh[vertex]
+    )
+    return SurfaceFit(mesh, model.vertex_sigma_m.copy(), seen, residual), state, iteration
+
+
+def find_pairs(model: BodyModel, target: Target, mesh: Array) -> Pairs:
+    """Step (a): each vertex' nearest point, nearer than 5 cm and within 15 degrees."""
+    normals = vertex_normals(mesh, model.faces)
+    point = target.tree.nearest(mesh, normals)
+    kept = compatible(
+        target.tree.points[point] - mesh,
+        normals,
+        target.tree.normals[point],
+        max_distance_m=MAX_CORRESPONDENCE_DISTANCE_M,
+        max_angle_rad=MAX_NORMAL_ANGLE_RAD,
+    )
+    return np.flatnonzero(kept), point[kept]
+
+
+def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array, Pairs]:
+    """Step (a), repeated: the mesh moves as one piece until its pairs settle."""
+    pairs = find_pairs(model, target, mesh)
+    for _ in range(_MOST_ALIGNMENTS):
+        if len(pairs[0]) < _LEAST_PAIRS:
+            raise InputError("the paper's method finds no start on this cloud; use --method joint")
+        mesh = transform(rigid_fit(target.tree.points[pairs[1]], mesh[pairs[0]]), mesh)
+        found = find_pairs(model, target, mesh)
+        settled = len(found[0]) == len(pairs[0]) and np.array_equal(found[1], pairs[1])
+        pairs = found
+        if settled:
+            break
+    return mesh, pairs
+
+
+def solve_pose_and_shape(model: BodyModel, mesh: Array, pairs: Pairs, target: Target) -> BodyState:
+    """Step (b): theta, then beta, each by its own quadratic energy, for the mesh at its pairs."""
+    pulled = mesh.copy()
+    pulled[pairs[0]] = target.tree.points[pairs[1]]
+    return model.project(pulled, iterations=2, ridge=_SHAPE_RIDGE)
+
+
+def solve_mesh(model_mesh: Array, pairs: Pairs, target: Target) -> Array:
+    """Step (c): E(Y') couples no two vertices, so its minimum is a weighted mean for each."""
+    mesh = model_mesh.copy()
+    vertex, point = pairs
+    mesh[vertex] = (mesh[vertex] + SURFACE_WEIGHT * target.tree.points[point]) / (
+        1.0 + SURFACE_WEIGHT
+    )
+    return mesh

@@ -1,0 +1,68 @@
+"""`reconstruct train` and `reconstruct evaluate-model`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
+)
+@click.option("--seed", default=0, show_default=True, help="the same seed learns the same model")
+@click.option("--bodies", default=4000, show_default=True, help="training bodies")
+@click.option("--poses", default=1500, show_default=True, help="training poses")
+@click.option("--components", default=160, show_default=True, help="shape components kept")
+def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> None:
+    """Build the database and learn the body model (minutes; needs the train extra).
+
+    \b
+    Examples:
+      reconstruct train --out workers/scape/model/data/body.npz
+      reconstruct train --out small.npz --bodies 300 --poses 100 --components 40
+    """
+    from workers.scape.learn.train import TrainingPlan
+    from workers.scape.learn.train import train as learn
+
+    def show(step: str, share: float) -> None:
+        click.echo(f"{100 * share:3.0f} %  {step}")
+
+    learn(out, TrainingPlan(bodies, poses, components, seed), show)
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+@click.command()
+@click.option("--model", type=click.Path(path_type=Path), help="the shipped one if absent")
+@click.option("--bodies", default=100, show_default=True, help="held-out bodies")
+@click.option("--seed", default=0, show_default=True)
+@click.option(
+    "--pictures",
+    type=click.Path(path_type=Path),
+    help="folder for pictures: components, worst case",
+)
+@click.option(
+    "--other-bodies",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="folder of npz files (vertices, faces; z up, facing -y) in any topology",
+)
+def evaluate_model(
+    model: Path | None,
+    bodies: int,
+    seed: int,
+    pictures: Path | None,
+    other_bodies: Path | None,
+) -> None:
+    """Test the model on bodies and poses that it was not learned from (needs the train extra).
+
+    \b
+    Examples:
+      reconstruct evaluate-model
+      reconstruct evaluate-model --model small.npz --bodies 20
+      reconstruct evaluate-model --pictures pictures --other-bodies scans
+    """
+    from workers.scape.learn.evaluate import Evaluation, evaluate
+
+    for line in evaluate(Evaluation(model, bodies, seed, pictures, other_bodies)):
+        click.echo(line)

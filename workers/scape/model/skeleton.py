@@ -1,0 +1,72 @@
+"""Where the parts of a body turn against each other: joints that follow from the model itself.
+
+The vertices are those whose edges come nearest to sum_p w_kp R_p e_k, so the body is a sum of one
+field a part: Y = sum_p V_p, where V_p solves for the edges w_kp e_k alone. When everything beyond a
+joint turns by D, the fields of those parts turn, the others stay: Y' = outside + D inside. Where
+the turning parts own all edges, `outside` is the same vector c for all vertices, and
+Y' = c + D (Y - c): c is the joint. No bones are learned, and none have to be carried.
+
+The pose-dependent deformation moves what lies beyond a joint as well: by u_m for a radian about
+axis m. The joint that does the same in least squares over the three axes, u_m = -e_m x d, lies
+d = 1/2 sum_m e_m x u_m farther on.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.scape.model.body_model import BodyModel
+from workers.scape.model.deformation import edges, vertex_areas
+
+Array = NDArray[np.float64]
+
+_OWNED = 0.98
+"""Skin weight from which on a vertex moves with its part alone."""
+
+
+def joint_positions(model: BodyModel, vertices: Array, rotations: Array) -> Array:
+    """Joints (L, 3) of a body as it stands, metres; the root's is the pelvis' centroid.
+
+    Args:
+        vertices: (P, 3) in the template's topology.
+        rotations: (L, 3, 3) of its parts, absolute.
+    """
+    pulls, shifts = _template_terms(model)
+    joints = model.anchor @ vertices + pulls @ edges(vertices, model.faces).reshape(-1, 3)
+    before = rotations[model.part_parents]
+    return np.asarray(joints + np.einsum("pij,pj->pi", before, shifts))
+
+
+@lru_cache(maxsize=2)
+def _template_terms(model: BodyModel) -> tuple[Array, Array]:
+    """What takes a body's edges (3K, 3) to its joints less the root's, (L, 3K) by the adjoint
+    solve, and how far the pose-dependent deformation moves them, (L, 3) in the parent's frame."""
+    areas = vertex_areas(model.mean, model.faces)
+    owners = np.zeros((model.vertex_count, model.part_count))
+    for part in range(model.part_count):
+        share = np.clip(model.vertex_weights[:, part] - _OWNED, 0.0, None) * areas
+        if not share.any():
+            share = model.vertex_weights[:, part] ** 4 * areas
+        owners[:, part] = share / share.sum()
+    green = model.solver.solve(owners - model.anchor[:, None])
+    reach = model.solver.incidence.T @ green
+    outside = 1.0 - model.triangle_part_weights @ _descends(model.part_parents).astype(float)
+    pulls = np.ascontiguousarray((reach * np.repeat(outside, 3, axis=0)).T)
+    pulls[0] = 0.0
+    fields = model.pose_fields.reshape(model.part_count - 1, 3, model.vertex_count, 3)
+    moved = np.einsum("vp,pmvi->pmi", owners[:, 1:], fields)
+    shifts = np.zeros((model.part_count, 3))
+    shifts[1:] = 0.5 * np.cross(np.eye(3), moved).sum(axis=1)
+    return pulls, shifts
+
+
+def _descends(parents: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(L, L): row part is column part, or hangs on it."""
+    found = np.eye(len(parents), dtype=bool)
+    for part, parent in enumerate(parents):
+        if parent >= 0:
+            found[part] |= found[parent]
+    return found

@@ -1,0 +1,220 @@
+"""Which triangles of a surface cross each other (numba; a sweep up a grid's columns finds the
+candidates)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.scape.model.deformation import Faces
+
+Array = NDArray[np.float64]
+
+_ROOM_M = 0.02
+
+
+def crossing_pairs(
+    vertices: Array, faces: Faces, asking: NDArray[np.bool_] | None = None
+) -> NDArray[np.int32]:
+    """Pairs (m, 2) of triangles that cross.
+
+    Triangles with one vertex in common count where they cross beyond it; those with an edge in
+    common cannot. Touching is not crossing.
+
+    Args:
+        vertices: (P, 3).
+        faces: (K, 3).
+        asking: (K,): pairs of others are left out; everyone asks by default.
+    """
+    corners = np.ascontiguousarray(vertices[faces])
+    lows, highs = _boxes(corners)
+    if asking is None:
+        asking = np.ones(len(faces), bool)
+        near = np.arange(len(faces))
+    else:
+        # What is far from all askers need not be looked at.
+        near = np.flatnonzero(_near(lows, highs, asking, _ROOM_M))
+    upwards = near[np.argsort(lows[near, 2], kind="stable")]
+    found = _crossing_pairs(
+        corners[upwards], lows[upwards], highs[upwards], faces[upwards], asking[upwards]
+    )
+    return np.sort(upwards[found], axis=1).astype(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _boxes(corners):  # type: ignore[no-untyped-def]  # pragma: no cover
+    lows, highs = corners[:, 0].copy(), corners[:, 0].copy()
+    for k in range(len(corners)):
+        for i in range(1, 3):
+            for c in range(3):
+                lows[k, c] = min(lows[k, c], corners[k, i, c])
+                highs[k, c] = max(highs[k, c], corners[k, i, c])
+    return lows, highs
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(lows, highs, asking, room):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Boxes that share a room of a coarse grid with an asker's box."""
+    low, high = lows[0].copy(), highs[0].copy()
+    for k in range(len(lows)):
+        for c in range(3):
+            low[c] = min(low[c], lows[k, c])
+            high[c] = max(high[c], highs[k, c])
+    x1, y1, z1 = _room_of(high, low, room)
+    occupied = np.zeros((x1 + 1, y1 + 1, z1 + 1), np.bool_)
+    near = asking.copy()
+    for marking in (True, False):
+        for k in range(len(lows)):
+            if asking[k] != marking:
+                continue
+            x0, y0, z0 = _room_of(lows[k], low, room)
+            x1, y1, z1 = _room_of(highs[k], low, room)
+            for x in range(x0, x1 + 1):
+                for y in range(y0, y1 + 1):
+                    for z in range(z0, z1 + 1):
+                        if marking:
+                            occupied[x, y, z] = True
+                        elif occupied[x, y, z]:
+                            near[k] = True
+    return near
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _room_of(point, low, room):  # type: ignore[no-untyped-def]  # pragma: no cover
+    return (
+        int((point[0] - low[0]) / room),
+        int((point[1] - low[1]) / room),
+        int((point[2] - low[2]) / room),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossing_pairs(corners, lows, highs, faces, asking):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Of triangles in the order of their lowest heights: a sweep upwards in every column."""
+    count = len(corners)
+    extent = 0.0
+    for k in range(count):
+        for c in range(2):
+            extent += highs[k, c] - lows[k, c]
+    # Wider than most triangles: few columns a triangle, few triangles at one height of a column.
+    width = max(1.5 * extent / count, 1e-6)
+    first = np.empty((count, 2), np.int64)
+    last = np.empty((count, 2), np.int64)
+    entries = 0
+    for k in range(count):
+        for c in range(2):
+            first[k, c] = int(np.floor(lows[k, c] / width))
+            last[k, c] = int(np.floor(highs[k, c] / width))
+        spans = last[k] - first[k] + 1
+        entries += spans[0] * spans[1]
+    buckets = 1
+    while buckets < 2 * entries:
+        buckets *= 2
+    start = np.zeros(buckets + 1, np.int64)
+    # Two passes: how many entries a bucket has, then the entries, from its last to its first.
+    triangle = np.empty(entries, np.int32)
+    columns = np.empty((entries, 2), np.int64)
+    boxes = np.empty((entries, 6))
+    for filling in range(2):
+        for k in range(count - 1, -1, -1):
+            for x in range(first[k, 0], last[k, 0] + 1):
+                for y in range(first[k, 1], last[k, 1] + 1):
+                    bucket = _bucket(x, y, buckets)
+                    if filling:
+                        start[bucket] -= 1
+                        entry = start[bucket]
+                        triangle[entry] = k
+                        columns[entry, 0], columns[entry, 1] = x, y
+                        boxes[entry, :3], boxes[entry, 3:] = lows[k], highs[k]
+                    else:
+                        start[bucket] += 1
+        if not filling:
+            for bucket in range(buckets):
+                start[bucket + 1] += start[bucket]
+    pairs = []
+    for bucket in range(buckets):
+        for i in range(start[bucket], start[bucket + 1]):
+            a = triangle[i]
+            for j in range(i + 1, start[bucket + 1]):
+                if boxes[j, 2] > boxes[i, 5]:
+                    break
+                if (
+                    boxes[i, 0] > boxes[j, 3]
+                    or boxes[j, 0] > boxes[i, 3]
+                    or boxes[i, 1] > boxes[j, 4]
+                    or boxes[j, 1] > boxes[i, 4]
+                ):
+                    continue
+                b = triangle[j]
+                if a == b or not (asking[a] or asking[b]):
+                    continue
+                # A pair is looked at in one column alone: the first that both are in.
+                x, y = max(first[a, 0], first[b, 0]), max(first[a, 1], first[b, 1])
+                if columns[i, 0] != x or columns[i, 1] != y:
+                    continue
+                if columns[j, 0] != x or columns[j, 1] != y:
+                    continue
+                if _cross(corners, faces, a, b):
+                    pairs.append((a, b))
+    out = np.empty((len(pairs), 2), np.int32)
+    for row in range(len(pairs)):
+        out[row, 0], out[row, 1] = pairs[row]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _bucket(x, y, buckets):  # type: ignore[no-untyped-def]  # pragma: no cover
+    # Primes of Teschner et al. 2003, "Optimized spatial hashing for collision detection".
+    return ((x * 73856093) ^ (y * 19349663)) & (buckets - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _cross(corners, faces, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
+    shared, at_a, at_b = 0, 0, 0
+    for i in range(3):
+        for j in range(3):
+            if faces[a, i] == faces[b, j]:
+                shared, at_a, at_b = shared + 1, i, j
+    if shared > 1:
+        return False
+    a0, a1, a2 = _from_corner(corners, a, at_a)
+    b0, b1, b2 = _from_corner(corners, b, at_b)
+    if _pierces(a1, a2, b0, b1, b2) or _pierces(b1, b2, a0, a1, a2):
+        return True
+    # The edges that meet in a common corner go no farther.
+    return shared == 0 and (
+        _pierces(a0, a1, b0, b1, b2)
+        or _pierces(a2, a0, b0, b1, b2)
+        or _pierces(b0, b1, a0, a1, a2)
+        or _pierces(b2, b0, a0, a1, a2)
+    )
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _from_corner(corners, k, first):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """A triangle's corners from one of them on."""
+    i, j = (first + 1) % 3, (first + 2) % 3
+    return (
+        (corners[k, first, 0], corners[k, first, 1], corners[k, first, 2]),
+        (corners[k, i, 0], corners[k, i, 1], corners[k, i, 2]),
+        (corners[k, j, 0], corners[k, j, 1], corners[k, j, 2]),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _pierces(start, end, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether an edge goes through a triangle: by the signs of volumes."""
+    if _volume(a, b, c, start) * _volume(a, b, c, end) >= 0.0:
+        return False
+    u, v, w = _volume(start, end, a, b), _volume(start, end, b, c), _volume(start, end, c, a)
+    return (u > 0.0 and v > 0.0 and w > 0.0) or (u < 0.0 and v < 0.0 and w < 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _volume(a, b, c, d):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Six times that of a tetrahedron."""
+    x0, x1, x2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    y0, y1, y2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    z0, z1, z2 = d[0] - a[0], d[1] - a[1], d[2] - a[2]
+    return x0 * (y1 * z2 - y2 * z1) + x1 * (y2 * z0 - y0 * z2) + x2 * (y0 * z1 - y1 * z0)
