@@ -92,7 +92,7 @@ def test_landmarks_lie_where_their_names_say(model: BodyModel) -> None:
     ],
 )
 def test_a_torn_model_is_named(tmp_path: Path, change: object, words: str) -> None:
-    shipped = Path(__file__).parents[2] / "workers/scape" / SHIPPED
+    shipped = Path(__file__).parents[2] / "workers/scape/model" / SHIPPED
     path = tmp_path / "model.npz"
     assert callable(change)
     path.write_bytes(change(shipped.read_bytes()))
