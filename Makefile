@@ -19,10 +19,10 @@ help:
 demo: $(VENV)/runtime.stamp
 	$(BIN)/python deploy/demo.py --folder $(DEMO)
 
-test: $(VENV)/dev.stamp
+test: $(VENV)/train.stamp
 	$(BIN)/python -m pytest
 
-check: $(VENV)/dev.stamp
+check: $(VENV)/train.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

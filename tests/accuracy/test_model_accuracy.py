@@ -6,14 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from workers.scape.learn.database import POPULATION, BodyDatabase
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
+from workers.scape.learn.train import TrainingPlan, train
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.cache import FOLDER_VARIABLE
-
-pytest.importorskip("anny", reason="the generator of bodies comes with the train extra")
-
-from workers.scape.learn.database import POPULATION, BodyDatabase
-from workers.scape.learn.train import TrainingPlan, train
+from workers.scape.model.sampled import SampledBody
 
 BODIES = 5
 
@@ -30,7 +28,7 @@ def database() -> BodyDatabase:
 
 def _rms_m(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     """Vertex rms of each body after the best fit of pose and shape."""
-    samples = model.at(np.arange(0, model.vertex_count, PROJECTION_STRIDE))
+    samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
     fitted = [model.vertices(best_fit(model, samples, body)) for body in bodies]
     return np.sqrt(np.mean(np.sum((np.array(fitted) - bodies) ** 2, axis=2), axis=1))
 
