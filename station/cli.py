@@ -11,6 +11,10 @@ COMMANDS = {
     "run": ("station.booth.supervisor:run", "run the whole booth in the foreground"),
     "start": ("station.booth.operator_cli:start", "start the sensors"),
     "scan": ("station.booth.operator_cli:scan", "scan the person in the booth"),
+    "cancel": (
+        "station.booth.operator_cli:cancel",
+        "give up a scan that has not been reconstructed",
+    ),
     "status": ("station.booth.operator_cli:status", "show cameras, scans and workers"),
     "stop": ("station.booth.operator_cli:stop", "stop the sensors"),
     "calibrate": (
@@ -18,6 +22,8 @@ COMMANDS = {
         "find where the cameras are",
     ),
     "check": ("station.calibration.drift.check_cli:check", "has a camera moved since?"),
+    "list": ("station.archive.list_cli:list_scans", "list scans, the newest first"),
+    "find": ("station.archive.list_cli:find", "find scans by label"),
     "purge": ("station.booth.retention:purge", "delete a scan and its results"),
     "capture": ("station.booth.capture:capture", "one camera's capture process"),
     "sync": ("station.booth.sync:sync", "the sync-and-merge process"),

@@ -15,7 +15,7 @@ import click
 import zmq
 
 from station.booth.retention import expire_old
-from station.booth.session import ON_DISK, Session, advance, expire
+from station.booth.session import CANCELLED, ON_DISK, Session, advance, expire
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
@@ -113,6 +113,8 @@ class ControlProcess:
             return Reply(ok=True, content={"streaming": self._streaming})
         if request.command == "scan":
             return self._scan(request)
+        if request.command == "cancel":
+            return self._cancel(request)
         if request.command == "scan-status":
             return Reply(ok=True, content=self._scan_status(request.scan_id))
         if request.command == "status":
@@ -131,6 +133,26 @@ class ControlProcess:
         for old in list(self._sessions)[:-_SESSIONS_KEPT]:
             del self._sessions[old]
         return Reply(ok=True, content=self._scan_status(request.scan_id))
+
+    def _cancel(self, request: Request) -> Reply:
+        """Give a scan up while it is taken or waits; later there is a result, to be purged."""
+        scan_id = request.scan_id
+        place = self._spool.where(scan_id)
+        status = self._scan_status(scan_id)
+        if status["state"] == "failed":
+            return Reply(ok=True, content=status)
+        if place is None:
+            answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
+            if not answer.ok:
+                return answer
+            self._sessions[scan_id] = advance(self._sessions[scan_id], "failed", reason=CANCELLED)
+        elif place != "queue" or not self._spool.withdraw(scan_id, CANCELLED):
+            return Reply(
+                ok=False,
+                error=f"scan {scan_id} is past cancelling (it is {status['state']}); "
+                f"delete it when it is done: station purge {scan_id}",
+            )
+        return Reply(ok=True, content=self._scan_status(scan_id))
 
     def _scan_status(self, scan_id: str) -> dict[str, Any]:
         """A scan's state; of accepted ones the disk is the truth.

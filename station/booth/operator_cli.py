@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from station.booth.session import FINAL
+from station.booth.session import FINAL, ON_DISK
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.spool import count_scans
@@ -92,6 +92,21 @@ def stop(config_path: Path | None) -> None:
 
 
 @click.command()
+@click.argument("scan_id")
+@config_option
+def cancel(scan_id: str, config_path: Path | None) -> None:
+    """Give up a scan that is being taken or waits for its reconstruction.
+
+    \b
+    Examples:
+      station cancel 20261121T100000Z-7f3a
+    """
+    config = load_config(find_config(config_path))
+    session = _command(config, Request("cancel", scan_id))
+    click.echo(f"scan {scan_id}: {session['reason'] or session['state']}")
+
+
+@click.command()
 @config_option
 @click.option("--json", "as_json", is_flag=True, help="for programs")
 def status(config_path: Path | None, as_json: bool) -> None:
@@ -158,7 +173,13 @@ def scan(
     began_s = time.monotonic()
     session = _command(config, Request("scan", scan_id, label))
     click.echo(f"scan {scan_id}")
-    session = _follow(config, scan_id, session, _enough(wait), began_s + timeout_s)
+    try:
+        session = _follow(config, scan_id, session, _enough(wait), began_s + timeout_s)
+    except KeyboardInterrupt:
+        raise BoothError(
+            f"scan {scan_id} goes on without this command; its state: station find {scan_id}; "
+            f"give it up: station cancel {scan_id}"
+        ) from None
     if session["state"] == "failed":
         raise BoothError(f"scan {scan_id} failed: {session['reason']}")
     if not wait:
@@ -185,9 +206,13 @@ def _follow(
     deadline_s: float,
 ) -> dict[str, Any]:
     """Show each new state on a line of its own until it is enough."""
-    told = ""
+    told, free = "", False
     while True:
         state = session["state"]
+        if state in ON_DISK and state != "accepted" and not free:
+            # The scan was quicker than the question: the person waits for this word.
+            click.echo(f"  {_WORDS['accepted']:<44}")
+        free = free or state in ON_DISK
         words = _WORDS.get(state, state)
         if state == "capturing" and session["wanted"]:
             words += f" ({session['framesets']} of {session['wanted']})"

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import click
 
+from station.archive.index import ScanIndex
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
 from station.core.spool import Spool
 
 _DAY_S = 86_400.0
+_MOST_OF_A_LABEL = 10_000
 
 
 def expire_old(spool: Spool, retention: RetentionConfig, now_s: float) -> list[Path]:
@@ -30,31 +32,57 @@ def expire_old(spool: Spool, retention: RetentionConfig, now_s: float) -> list[P
     return removed
 
 
+def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
+    """Delete a scan, its bundle and its results.
+
+    Raises:
+        SpoolError: there is no such scan, or it is being reconstructed.
+    """
+    if spool.path("work", scan_id) in (folders := _folders(spool, scan_id)):
+        raise SpoolError(f"scan {scan_id} is being reconstructed; try again when it is done")
+    if not folders:
+        raise SpoolError(f"there is no scan {scan_id} in {spool.folder}")
+    for folder in folders:
+        shutil.rmtree(folder)
+    return folders
+
+
+def _folders(spool: Spool, scan_id: str) -> list[Path]:
+    return [folder for _, folder in spool.every() if folder.name == scan_id]
+
+
 @click.command()
 @click.argument("scan_id", required=False)
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option("--label", help="delete all scans with exactly this label")
 @click.option("--old", is_flag=True, help="remove everything past its retention period")
-def purge(scan_id: str | None, config_path: Path | None, old: bool) -> None:
-    """Delete a scan and its results, or all that are past their time.
+def purge(scan_id: str | None, config_path: Path | None, label: str | None, old: bool) -> None:
+    """Delete a scan and its results, all scans of a label, or all that are past their time.
 
     \b
     Examples:
       station purge 20261121T100000Z-7f3a
+      station purge --label "Order 1234"
       station purge --old
     """
+    if sum([bool(scan_id), label is not None, old]) != 1:
+        raise click.UsageError("give a scan id, --label or --old")
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
     if old:
         removed = expire_old(spool, config.retention, time.time())
     elif scan_id:
-        removed = [folder for _, folder in spool.every() if folder.name == scan_id]
-        if not removed:
-            raise SpoolError(f"there is no scan {scan_id} in {spool.folder}")
-        if spool.path("work", scan_id) in removed:
-            raise SpoolError(f"scan {scan_id} is being reconstructed; try again when it is done")
-        for folder in removed:
-            shutil.rmtree(folder)
+        removed = purge_scan(spool, scan_id)
     else:
-        raise click.UsageError("give a scan id, or --old")
+        removed = _purge_label(spool, str(label))
+    # Its labels go with the scans, now and not at the next look.
+    ScanIndex(spool).find(limit=0)
     for folder in removed:
         click.echo(f"removed {folder}")
+
+
+def _purge_label(spool: Spool, label: str) -> list[Path]:
+    found = ScanIndex(spool).find(label=label, limit=_MOST_OF_A_LABEL)
+    if not found:
+        raise SpoolError(f"there is no scan with the label {label!r}; see station list")
+    return [folder for scan in found for folder in purge_scan(spool, scan.scan_id)]

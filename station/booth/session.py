@@ -15,6 +15,8 @@ from typing import Literal
 State = Literal["armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"]
 FINAL: frozenset[State] = frozenset({"delivered", "rescan", "failed"})
 ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered", "rescan"})
+CANCELLED = "cancelled by the operator"
+"""The reason of a scan that failed because it was given up."""
 _ORDER: dict[State, int] = {
     "armed": 0, "capturing": 1, "accepted": 2, "reconstructing": 3,
     "delivered": 4, "rescan": 4, "failed": 4,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import merged_points
+from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, write_bundle
@@ -173,6 +174,8 @@ class SyncProcess:
         if request.command == "scan":
             self._start_collection(request.scan_id, request.label)
             return Reply(ok=True)
+        if request.command == "cancel":
+            return self._cancel(request.scan_id)
         if request.command == "status":
             return Reply(ok=True, content=self._status())
         return Reply(ok=False, error=f"sync knows no command {request.command!r}")
@@ -205,6 +208,15 @@ class SyncProcess:
         deadline_s = time.monotonic() + self._config.scan.max_duration_s
         self._collection = Collection(scan_id, label, deadline_s)
         self._tell(self._collection, "capturing")
+
+    def _cancel(self, scan_id: str) -> Reply:
+        """Collect a scan no further; what was collected is dropped."""
+        collection = self._collection
+        if collection is None or collection.scan_id != scan_id:
+            return Reply(ok=False, error=f"scan {scan_id} is not being taken")
+        self._collection = None
+        self._end(collection, "failed", CANCELLED)
+        return Reply(ok=True)
 
     def _why(self, camera: str) -> str:
         health = self._health.get(camera)

@@ -112,6 +112,19 @@ class Spool:
             return Claim(self, scan_id, lock, self._count_try(scan_id))
         return None
 
+    def withdraw(self, scan_id: str, reason: str) -> bool:
+        """Take a waiting scan off the queue into failed/; False if it does not wait (any more)."""
+        lock = self._lock(scan_id)
+        if lock is None:
+            return False
+        try:
+            os.rename(self.path("queue", scan_id), self.path("work", scan_id))
+        except FileNotFoundError:
+            os.close(lock)
+            return False
+        Claim(self, scan_id, lock, self._tries(scan_id)).fail(reason)
+        return True
+
     def recover(self, retries: int) -> list[str]:
         """Put back the scans of workers that died; fail those that were tried too often.
 

@@ -118,7 +118,7 @@ class Request(Message):
     """A command to control or sync; the same scan id twice is the same scan."""
 
     command: str
-    """"start", "stop", "scan", "scan-status" or "status"."""
+    """"start", "stop", "scan", "cancel", "scan-status" or "status"."""
     scan_id: str = ""
     label: str = ""
 

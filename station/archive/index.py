@@ -1,0 +1,203 @@
+"""All scans of a spool by label and time, found without reading every folder again.
+
+A database beside the folders (`index.sqlite`) remembers what they said. The folders are the truth:
+each look compares names, reads what is new and forgets what is gone, and a database that is
+missing or damaged is made anew from them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from station.archive.records import PLACES, ScanRecord, ScanState, read_record
+from station.core.spool import Spool
+
+FILE = "index.sqlite"
+_VERSION = 1
+_BUSY_S = 10.0
+_SETTLED_NS = 50_000_000
+"""A folder that changed this recently may change again within the same tick of its clock."""
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS scans (
+  scan_id TEXT PRIMARY KEY, place TEXT NOT NULL, state TEXT NOT NULL,
+  label TEXT NOT NULL, sought TEXT NOT NULL, booth TEXT NOT NULL,
+  created TEXT NOT NULL, finished TEXT NOT NULL, reasons TEXT NOT NULL, seconds TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS by_time ON scans (created DESC, scan_id DESC);
+CREATE TABLE IF NOT EXISTS folders (place TEXT PRIMARY KEY, changed_ns INTEGER NOT NULL);
+"""
+_COLUMNS = "scan_id, state, label, booth, created, finished, reasons, seconds"
+
+
+class ScanIndex:
+    """Scans by label and time. Safe for several processes at once."""
+
+    def __init__(self, spool: Spool) -> None:
+        self._spool = spool
+        self._path = spool.folder / FILE
+
+    def find(
+        self,
+        text: str = "",
+        *,
+        label: str | None = None,
+        since: str = "",
+        until: str = "",
+        states: Sequence[ScanState] = (),
+        before: tuple[str, str] | None = None,
+        limit: int = 100,
+    ) -> list[ScanRecord]:
+        """Scans, the newest first.
+
+        Args:
+            text: what the label or the scan id contains, whatever its case.
+            label: the whole label, exactly.
+            since, until: bounds of `created`, ISO 8601, the second one excluded.
+            states: any of them; all if empty.
+            before: (created, scan_id) of the last scan of the page before.
+            limit: at most so many.
+        """
+        where, values = ["1"], list[str | int]()
+        if text:
+            where.append("(instr(sought, ?) OR instr(lower(scan_id), ?))")
+            values += [text.casefold(), text.lower()]
+        if label is not None:
+            where.append("label = ?")
+            values.append(label)
+        if since:
+            where.append("created >= ?")
+            values.append(since)
+        if until:
+            where.append("created < ?")
+            values.append(until)
+        if states:
+            where.append(f"state IN ({', '.join('?' * len(states))})")
+            values += states
+        if before:
+            where.append("(created, scan_id) < (?, ?)")
+            values += before
+        query = (
+            f"SELECT {_COLUMNS} FROM scans WHERE {' AND '.join(where)} "
+            "ORDER BY created DESC, scan_id DESC LIMIT ?"
+        )
+        with self._open() as database:
+            self._refresh(database)
+            return [_record(row) for row in database.execute(query, [*values, limit])]
+
+    def get(self, scan_id: str) -> ScanRecord | None:
+        """One scan, or None if no folder of the spool holds it."""
+        with self._open() as database:
+            self._refresh(database)
+            query = f"SELECT {_COLUMNS} FROM scans WHERE scan_id = ?"
+            row = database.execute(query, [scan_id]).fetchone()
+        return None if row is None else _record(row)
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        try:
+            database = self._connect()
+        except sqlite3.DatabaseError:
+            # Torn, or another program's: what it knew is in the folders.
+            for suffix in ("", "-wal", "-shm"):
+                Path(f"{self._path}{suffix}").unlink(missing_ok=True)
+            database = self._connect()
+        with closing(database):
+            yield database
+
+    def _connect(self) -> sqlite3.Connection:
+        mask = os.umask(0o177)
+        try:
+            database = sqlite3.connect(self._path, timeout=_BUSY_S, isolation_level=None)
+        finally:
+            os.umask(mask)
+        try:
+            database.execute("PRAGMA journal_mode = WAL")
+            # Labels of purged scans must not stay behind in the file's free pages.
+            database.execute("PRAGMA secure_delete = ON")
+            found = database.execute("PRAGMA user_version").fetchone()[0]
+            if found not in (0, _VERSION):
+                raise sqlite3.DatabaseError(f"version {found}")
+            database.executescript(_SCHEMA)
+            database.execute(f"PRAGMA user_version = {_VERSION}")
+        except sqlite3.Error:
+            database.close()
+            raise
+        return database
+
+    def _refresh(self, database: sqlite3.Connection) -> None:
+        """Bring the database up to what the folders hold now."""
+        changed = {place: self._changed_ns(place) for place in PLACES}
+        known = dict(database.execute("SELECT place, changed_ns FROM folders"))
+        if known == changed:
+            return
+        with _transaction(database):
+            rows = dict(database.execute("SELECT scan_id, place FROM scans"))
+            # Later folders overwrite: a result's bundle may not have been put away yet.
+            found = {name: place for place in PLACES for name in _names(self._spool.folder / place)}
+            for scan_id in rows.keys() - found.keys():
+                database.execute("DELETE FROM scans WHERE scan_id = ?", [scan_id])
+            for scan_id, place in found.items():
+                if rows.get(scan_id) != place:
+                    self._take(database, place, scan_id)
+            now_ns = time.time_ns()
+            settled = {p: ns if now_ns - ns > _SETTLED_NS else 0 for p, ns in changed.items()}
+            database.executemany(
+                "INSERT OR REPLACE INTO folders VALUES (?, ?)", list(settled.items())
+            )
+
+    def _changed_ns(self, place: str) -> int:
+        try:
+            return (self._spool.folder / place).stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def _take(self, database: sqlite3.Connection, place: str, scan_id: str) -> None:
+        record = read_record(self._spool, place, scan_id)
+        if record is None:
+            return
+        database.execute(
+            "INSERT OR REPLACE INTO scans VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [
+                record.scan_id, place, record.state, record.label, record.label.casefold(),
+                record.booth, record.created, record.finished,
+                json.dumps(record.reasons), json.dumps(dict(record.seconds)),
+            ],
+        )  # fmt: skip
+
+
+@contextmanager
+def _transaction(database: sqlite3.Connection) -> Iterator[None]:
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+    except BaseException:
+        database.execute("ROLLBACK")
+        raise
+    database.execute("COMMIT")
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return [entry.name for entry in entries if not entry.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def _record(row: tuple[str, ...]) -> ScanRecord:
+    scan_id, state, label, booth, created, finished, reasons, seconds = row
+    return ScanRecord(
+        scan_id,
+        state,  # type: ignore[arg-type]  # only such are written
+        label,
+        booth,
+        created,
+        finished,
+        tuple(json.loads(reasons)),
+        json.loads(seconds),
+    )

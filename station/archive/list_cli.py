@@ -1,0 +1,75 @@
+"""`station list` and `station find`: scans by time and by whose they are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from station.archive.index import ScanIndex
+from station.archive.records import ScanRecord
+from station.core.config import find_config, load_config
+from station.core.spool import Spool
+
+_WORDS = {
+    "accepted": "waiting",
+    "reconstructing": "reconstructing",
+    "delivered": "ok",
+    "rescan": "scan again",
+    "failed": "failed",
+}
+
+
+@click.command("list")
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
+@click.option("--limit", default=20, show_default=True, help="at most so many, the newest first")
+@click.option("--json", "as_json", is_flag=True, help="for programs")
+def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
+    """List the scans of this booth, the newest first, with what became of them.
+
+    \b
+    Examples:
+      station list
+      station list --since 2026-11-21 --limit 200
+      station list --json
+    """
+    _show(config_path, "", since, limit, as_json)
+
+
+@click.command()
+@click.argument("text")
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option("--limit", default=20, show_default=True, help="at most so many, the newest first")
+@click.option("--json", "as_json", is_flag=True, help="for programs")
+def find(text: str, config_path: Path | None, limit: int, as_json: bool) -> None:
+    """Find scans whose label or id contains TEXT, whatever its case.
+
+    \b
+    Examples:
+      station find "Order 1234"
+      station find 20261121
+    """
+    _show(config_path, text, "", limit, as_json)
+
+
+def _show(config_path: Path | None, text: str, since: str, limit: int, as_json: bool) -> None:
+    config = load_config(find_config(config_path))
+    found = ScanIndex(Spool(config.spool.folder)).find(text, since=since, limit=limit)
+    if as_json:
+        click.echo(json.dumps([{**asdict(scan), "verdict": scan.verdict} for scan in found]))
+        return
+    if not found:
+        click.echo(f"no scan with {text!r}" if text else "no scans yet")
+    for scan in found:
+        click.echo(_line(scan))
+
+
+def _line(scan: ScanRecord) -> str:
+    taken = scan.created.replace("T", " ").removesuffix("Z")
+    # A label is somebody's text: control characters would reach the terminal.
+    label = "".join(c if c.isprintable() else "?" for c in scan.label) or "-"
+    reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons else ""
+    return f"{scan.scan_id:<24} {taken}  {_WORDS[scan.state]:<14} {label}{reasons}"

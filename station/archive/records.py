@@ -1,0 +1,97 @@
+"""One scan as its folder tells: whose it is, when it was taken, what became of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from station.core.spool import REASON, Spool
+
+ScanState = Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]
+PLACES: dict[str, ScanState] = {
+    "queue": "accepted",
+    "work": "reconstructing",
+    "failed": "failed",
+    "outbox": "delivered",
+}
+"""Folder of the spool -> state; a result in the outbox may also say that the scan is to be done
+again. In the order in which a scan passes them: of a scan in two, the later counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRecord:
+    """What is known of a scan on disk."""
+
+    scan_id: str
+    state: ScanState
+    label: str
+    booth: str
+    created: str
+    """UTC, ISO 8601: when its frames were taken."""
+    finished: str
+    """UTC, ISO 8601: when it was delivered or given up; empty before."""
+    reasons: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """What each step of the reconstruction took."""
+
+    @property
+    def verdict(self) -> str:
+        """ "ok", "rescan", "failed", or "" while it is not known."""
+        return {"delivered": "ok", "rescan": "rescan", "failed": "failed"}.get(self.state, "")
+
+
+def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
+    """A scan in a folder of the spool; None when it has just left that folder."""
+    folder = spool.path(place, scan_id)
+    try:
+        changed = _moment(folder.stat().st_mtime)
+    except OSError:
+        return None
+    if place == "outbox":
+        result = _read(folder / "result.json")
+        # Results of earlier versions do not say whose they are; their bundle does, while it is
+        # kept.
+        bundle = {} if "label" in result else _read(spool.path("done", scan_id) / "bundle.json")
+        origin = {**bundle, **result}
+        state: ScanState = "rescan" if result.get("status") == "rescan" else "delivered"
+        reasons = tuple(str(reason) for reason in result.get("reasons", ()))
+        seconds = {str(k): float(v) for k, v in result.get("seconds", {}).items()}
+    else:
+        origin, state, seconds = _read(folder / "bundle.json"), PLACES[place], {}
+        reason = _read(folder / REASON).get("reason")
+        reasons = (str(reason),) if state == "failed" and reason else ()
+    return ScanRecord(
+        scan_id=scan_id,
+        state=state,
+        label=str(origin.get("label", "")),
+        booth=str(origin.get("booth", "")),
+        created=str(origin.get("created", "")) or moment_of(scan_id) or changed,
+        finished=changed if place in ("outbox", "failed") else "",
+        reasons=reasons,
+        seconds=seconds,
+    )
+
+
+def moment_of(scan_id: str) -> str:
+    """The time in a scan id (20261121T100000Z-7f3a), ISO 8601; empty if it holds none."""
+    try:
+        moment = datetime.strptime(scan_id.split("-")[0], "%Y%m%dT%H%M%SZ")
+    except ValueError:
+        return ""
+    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _moment(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}

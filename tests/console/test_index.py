@@ -1,0 +1,150 @@
+"""Scans are found by label and time, from the folders alone."""
+
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from station.archive.index import FILE, ScanIndex
+from station.booth.retention import purge
+from station.cli import station
+from station.core.files import write_json
+from station.core.spool import REASON, Spool
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    spool = Spool(tmp_path / "spool")
+    for number, (place, label) in enumerate(
+        [
+            ("queue", "Order 7"),
+            ("outbox", "Order 1234"),
+            ("failed", "ÅNGSTRÖM"),
+            ("outbox", "訂單 9"),
+        ]
+    ):
+        folder = spool.path(place, f"2026112{number}T100000Z-000{number}")
+        folder.mkdir()
+        document = {"label": label, "created": f"2026-11-2{number}T10:00:00Z", "booth": "b"}
+        if place == "outbox":
+            document |= {"status": "ok" if number == 1 else "rescan", "reasons": ["arm"]}
+            write_json(folder / "result.json", document)
+        else:
+            write_json(folder / "bundle.json", document)
+        if place == "failed":
+            write_json(folder / REASON, {"reason": "nobody there"})
+    return spool
+
+
+def _labels(index: ScanIndex, *text: str) -> list[str]:
+    return [scan.label for scan in index.find(*text)]
+
+
+def test_scans_are_found_whatever_the_case_and_script(spool: Spool) -> None:
+    index = ScanIndex(spool)
+    assert _labels(index) == ["訂單 9", "ÅNGSTRÖM", "Order 1234", "Order 7"]
+    assert _labels(index, "order 1234") == ["Order 1234"]
+    assert _labels(index, "ångström") == ["ÅNGSTRÖM"]
+    assert _labels(index, "訂單") == ["訂單 9"]
+    assert _labels(index, "20261120t") == ["Order 7"]
+    # A wildcard of the database is a character like any other.
+    assert _labels(index, "%") == []
+    verdicts = {scan.label: scan.verdict for scan in index.find()}
+    assert verdicts == {"訂單 9": "rescan", "ÅNGSTRÖM": "failed", "Order 1234": "ok", "Order 7": ""}
+    failed = index.find(states=["failed"])[0]
+    assert failed.reasons == ("nobody there",)
+    day = index.find(since="2026-11-21", until="2026-11-22")
+    assert [scan.label for scan in day] == ["Order 1234"]
+
+
+def test_pages_hold_each_scan_once(spool: Spool) -> None:
+    index, seen, before = ScanIndex(spool), [], None
+    while page := index.find(before=before, limit=3):
+        seen += [scan.scan_id for scan in page]
+        before = (page[-1].created, page[-1].scan_id)
+    assert len(seen) == len(set(seen)) == 4
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a database, " * 400])
+def test_a_lost_or_damaged_index_is_made_anew(spool: Spool, damage: bytes) -> None:
+    assert len(ScanIndex(spool).find()) == 4
+    for path in spool.folder.glob(f"{FILE}*"):
+        path.unlink()
+    if damage:
+        (spool.folder / FILE).write_bytes(damage)
+    assert len(ScanIndex(spool).find()) == 4
+
+
+def test_the_index_follows_the_folders(spool: Spool) -> None:
+    index = ScanIndex(spool)
+    assert index.get("20261120T100000Z-0000").state == "accepted"
+    spool.path("queue", "20261120T100000Z-0000").rename(spool.path("work", "20261120T100000Z-0000"))
+    assert index.get("20261120T100000Z-0000").state == "reconstructing"
+    shutil.rmtree(spool.path("outbox", "20261121T100000Z-0001"))
+    assert index.get("20261121T100000Z-0001") is None
+    # Nothing of a label stays in the file.
+    assert b"Order 1234" not in b"".join(p.read_bytes() for p in spool.folder.glob(f"{FILE}*"))
+
+
+def test_an_old_result_takes_its_label_from_its_bundle(spool: Spool) -> None:
+    folder = spool.path("outbox", "20261125T100000Z-0005")
+    folder.mkdir()
+    write_json(folder / "result.json", {"status": "ok", "reasons": []})
+    bundle = spool.path("done", folder.name)
+    bundle.mkdir()
+    write_json(bundle / "bundle.json", {"label": "Order 5", "created": "2026-11-25T10:00:01Z"})
+    found = ScanIndex(spool).get(folder.name)
+    assert (found.label, found.created) == ("Order 5", "2026-11-25T10:00:01Z")
+
+
+def test_many_readers_at_once(spool: Spool) -> None:
+    wrong: list[object] = []
+
+    def look() -> None:
+        for _ in range(20):
+            found = ScanIndex(spool).find()
+            if len(found) != 4:
+                wrong.append(found)
+
+    threads = [threading.Thread(target=look) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def _booth(spool: Spool) -> list[str]:
+    config = spool.folder.parent / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    return ["--config", str(config)]
+
+
+def test_list_and_find_on_the_command_line(spool: Spool) -> None:
+    option = _booth(spool)
+    listed = CliRunner().invoke(station, ["list", *option])
+    assert listed.output.splitlines()[0].startswith("20261123T100000Z-0003")
+    assert "scan again" in listed.output
+    found = CliRunner().invoke(station, ["find", "order 1234", "--json", *option])
+    assert [scan["scan_id"] for scan in json.loads(found.output)] == ["20261121T100000Z-0001"]
+    assert "no scan with 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
+
+
+def test_purge_by_label(spool: Spool) -> None:
+    option = _booth(spool)
+    done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
+    assert done.exit_code == 0, done.output
+    assert not spool.path("outbox", "20261121T100000Z-0001").exists()
+    assert len(ScanIndex(spool).find()) == 3
+    assert CliRunner().invoke(purge, ["--label", "Order", *option]).exit_code == 1
+    assert CliRunner().invoke(purge, ["x", "--old", *option]).exit_code == 2
+
+
+def test_a_waiting_scan_is_withdrawn_once(spool: Spool) -> None:
+    assert spool.withdraw("20261120T100000Z-0000", "cancelled")
+    assert not spool.withdraw("20261120T100000Z-0000", "cancelled")
+    assert ScanIndex(spool).get("20261120T100000Z-0000").reasons == ("cancelled",)
+    assert spool.claim() is None
