@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.detect.ball_image import ball_inverse_depth
 from station.calibration.detect.detections import (
     FLOOR,
     BallDetection,
@@ -20,7 +21,7 @@ from station.calibration.detect.detections import (
 )
 from station.calibration.solve import depth_correction
 from station.calibration.solve.depth_correction import MIDDLE, correction_of
-from station.calibration.solve.joint import ball_inverse_depth, local_equations
+from station.calibration.solve.joint import local_equations
 from station.calibration.solve.problem import Sightings
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import ROUNDING, SQUARE_ERROR

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.lens import rays
 from station.core.rig import Rig
 
 _STRIDE_PX = 6
@@ -22,15 +23,7 @@ def merged_points(
         z = depth[::_STRIDE_PX, ::_STRIDE_PX] * np.float32(scale_m)
         v, u = np.nonzero(z)
         distance = z[v, u]
-        K = camera.K
-        points = np.stack(
-            [
-                (u * _STRIDE_PX - K[0, 2]) / K[0, 0] * distance,
-                (v * _STRIDE_PX - K[1, 2]) / K[1, 1] * distance,
-                distance,
-            ],
-            axis=1,
-        )
+        points = rays(camera)[v * _STRIDE_PX, u * _STRIDE_PX] * distance[:, None]
         pose = camera.world_from_camera
         clouds.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
     return np.concatenate(clouds) if clouds else np.empty((0, 3), np.float32)

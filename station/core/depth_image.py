@@ -1,4 +1,4 @@
-"""Depth images: where neighbouring readings lie on one surface."""
+"""Depth images: inverse depth, and discontinuities between surfaces."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 JUMP_RATIO = 0.02
 """Neighbouring readings of one surface differ by less than this share of their depth a pixel."""
+
+
+def inverse_depth(depth_m: Image) -> Image:
+    """1/z of depths (h, w) in metres; 0 (no reading) stays 0."""
+    return np.divide(np.float32(1.0), depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
 
 
 def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:

@@ -86,6 +86,22 @@ def se3_exp(xi: ArrayLike) -> Array:
     return rigid(so3_exp(twist[:3]), twist[3:])
 
 
+def twist_between(a_from_b: ArrayLike, a_from_c: ArrayLike) -> Array:
+    """The twist xi (6,) of ``a_from_c = a_from_b @ se3_exp(xi)``, in frame b."""
+    difference = invert(a_from_b) @ np.asarray(a_from_c, dtype=np.float64)
+    return np.concatenate([so3_log(difference[:3, :3]), difference[:3, 3]])
+
+
+def adjoint(b_from_a: ArrayLike) -> Array:
+    """The matrix (6, 6) that takes a small twist of frame a to the same motion in frame b."""
+    transform_ = np.asarray(b_from_a, dtype=np.float64)
+    rotation, shift = transform_[:3, :3], transform_[:3, 3]
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = rotation
+    matrix[3:, :3] = skew(shift) @ rotation
+    return matrix
+
+
 def invert(a_from_b: ArrayLike) -> Array:
     """b_from_a of a rigid a_from_b, 4x4."""
     matrix = np.asarray(a_from_b, dtype=np.float64)

@@ -27,10 +27,10 @@ import synthetic_calibration as synthetic
 
 from station.calibration.detect.detections import Observations
 from station.calibration.solve.solution import solve
-from station.calibration.solve.world import relatives, twist_between
+from station.calibration.solve.world import relatives
 from station.core.bundle import read_bundle
 from station.core.errors import CalibrationError
-from station.core.geometry import invert
+from station.core.geometry import invert, twist_between
 from station.core.rig import Rig
 from station.simulation.observations import simulate
 from station.simulation.procedure import VirtualProcedure

@@ -4,12 +4,13 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from station.calibration.detect.ball_image import ball_inverse_depth
 from station.calibration.solve.depth_correction import correction_of, design
-from station.calibration.solve.joint import TREMOR_M, ball_inverse_depth, trembling
+from station.calibration.solve.joint import TREMOR_M, trembling
 from station.calibration.solve.pairwise import Track, relate
 from station.calibration.solve.trajectory import KNOT_S, TimeGrid, along
-from station.calibration.solve.world import Placed, relatives, twist_between
-from station.core.geometry import invert, se3_exp, transform
+from station.calibration.solve.world import Placed, relatives
+from station.core.geometry import invert, se3_exp, transform, twist_between
 
 SEEDS = st.integers(0, 10_000)
 

@@ -10,9 +10,9 @@ import synthetic_calibration as synthetic
 from station.calibration.detect.detections import BallDetection, Observations
 from station.calibration.solve import joint
 from station.calibration.solve.solution import Solution, solve
-from station.calibration.solve.world import relatives, twist_between
+from station.calibration.solve.world import relatives
 from station.core.errors import CalibrationError
-from station.core.geometry import invert, transform
+from station.core.geometry import invert, transform, twist_between
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import Rig
 from station.simulation.procedure import BALL, VirtualProcedure

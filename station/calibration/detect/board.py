@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from station.core.errors import CalibrationError
 from station.core.geometry import rigid, so3_exp, transform
+from station.core.lens import pixel_rays, project
 from station.core.rig import CameraCalibration, Rig
 
 Array = NDArray[np.float64]
@@ -226,10 +227,7 @@ def _held_out_m(camera: CameraCalibration, views: Sequence[BoardView], board: Bo
             camera_from_board = _placed(camera, view, board, chosen)
             rest = board.corners_m()[view.ids[~chosen]]
             there = transform(camera_from_board, rest)
-            pixels, _ = cv2.projectPoints(
-                there, np.zeros(3), np.zeros(3), camera.K, camera.distortion
-            )
-            error_px = np.linalg.norm(pixels[:, 0] - view.pixels[~chosen], axis=1)
+            error_px = np.linalg.norm(project(camera, there) - view.pixels[~chosen], axis=1)
             off.append(error_px * there[:, 2] / camera.K[0, 0])
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
@@ -255,10 +253,8 @@ def _placed(
 def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
     """How far two lenses put what a pixel sees apart at the working distance, 95th percentile."""
     u, v = np.meshgrid(np.linspace(0, one.width - 1, 17), np.linspace(0, one.height - 1, 13))
-    pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
-    ahead = [
-        cv2.undistortPoints(pixels, camera.K, camera.distortion)[:, 0] for camera in (one, other)
-    ]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    ahead = [pixel_rays(camera, pixels) for camera in (one, other)]
     return float(
         WORKING_DISTANCE_M * np.percentile(np.linalg.norm(ahead[0] - ahead[1], axis=1), 95)
     )

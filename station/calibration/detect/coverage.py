@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from station.calibration.detect.detections import BallDetection
+from station.core.lens import project
 from station.core.rig import CameraCalibration
 
 _ENOUGH_SEEN = 120
@@ -40,9 +41,8 @@ class Coverage:
     def add(self, ball: BallDetection) -> None:
         """Take one more detection."""
         camera = self._cameras[ball.camera]
-        x, y, z = ball.center_m
-        u = camera.K[0, 0] * x / z + camera.K[0, 2]
-        v = camera.K[1, 1] * y / z + camera.K[1, 2]
+        z = float(ball.center_m[2])
+        u, v = project(camera, ball.center_m)
         row = int(np.clip(3 * v / camera.height, 0, 2))
         column = int(np.clip(3 * u / camera.width, 0, 2))
         self._cells[ball.camera][row, column] += 1

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.detections import FLOOR, PlaneObservation
-from station.core.depth_image import jumps
+from station.core.depth_image import Image, inverse_depth, jumps
 from station.core.kinect_v1 import RANDOM_SIGMA, ROUNDING, SQUARE_ERROR
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _CELL_PX = 12
@@ -64,7 +63,7 @@ def observe_wall(
 ) -> PlaneObservation | None:
     """A board that was brought into the booth, in frames (n, h, w); None where it is not seen."""
     depth_m, count = _whole_mean(stack, scale_m)
-    only = _inverse(depth_m) > _inverse(background_m) + _FOREGROUND
+    only = inverse_depth(depth_m) > inverse_depth(background_m) + _FOREGROUND
     return _observe(depth_m, count, camera, surface, axis=2, only=only)
 
 
@@ -90,15 +89,11 @@ def _whole_mean(stack: NDArray[np.uint16], scale_m: float) -> tuple[Image, Image
     )
 
 
-def _inverse(depth_m: Image) -> Array:
-    return np.where(depth_m > 0, 1.0 / np.where(depth_m > 0, depth_m, 1.0), 0.0)
-
-
 def _observe(
     depth_m: Image, count: Image, camera: CameraCalibration, surface: str, *, axis: int, only: Mask
 ) -> PlaneObservation | None:
     usable = only & ~jumps(depth_m) & (depth_m < _FARTHEST_M)
-    inverse = _inverse(depth_m)
+    inverse = inverse_depth(depth_m).astype(np.float64)
     ray = rays(camera).astype(np.float64)
     grid = np.zeros_like(usable)
     grid[::_STRIDE_PX, ::_STRIDE_PX] = True

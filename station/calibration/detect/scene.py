@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.depth_image import Image, inverse_depth
 from station.core.errors import FormatError
 from station.core.files import write_bytes
-
-Image = NDArray[np.float32]
 
 VERSION = 1
 SMOOTHING_PX = 3.0
@@ -92,10 +91,9 @@ class StaticView:
             ) from None
 
 
-def inverse_depth(depth: NDArray[np.uint16], scale_m: float) -> Image:
+def raw_inverse_depth(depth: NDArray[np.uint16], scale_m: float) -> Image:
     """1/z in 1/m of a depth frame in units of scale_m; 0 stays 0."""
-    metres = depth.astype(np.float32) * np.float32(scale_m)
-    return np.divide(1.0, metres, out=np.zeros_like(metres), where=metres > 0)
+    return inverse_depth(depth.astype(np.float32) * np.float32(scale_m))
 
 
 def smoothed(inverse: Image, share: Image) -> tuple[Image, Image]:
@@ -113,7 +111,7 @@ def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticV
     """
     count = 0
     for frame in frames:
-        inverse = inverse_depth(frame, scale_m)
+        inverse = raw_inverse_depth(frame, scale_m)
         there = (inverse > 0).astype(np.float32)
         images = np.stack(smoothed(inverse, there))
         if not count:

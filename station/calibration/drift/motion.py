@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import (
     SMOOTHING_PX,
-    Image,
     StaticView,
-    inverse_depth,
+    raw_inverse_depth,
     smoothed,
 )
+from station.core.depth_image import Image
 from station.core.geometry import invert, se3_exp, skew, transform
-from station.core.lens import rays
+from station.core.lens import project, rays
 from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
@@ -258,7 +258,7 @@ def estimate_move(
     only a few pixels far. The covariance is that of the sensor's own noise, as measured when the
     background was stored.
     """
-    inverse = [inverse_depth(frame, scale_m) for frame in frames]
+    inverse = [raw_inverse_depth(frame, scale_m) for frame in frames]
     share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
     now = smoothed(np.asarray(np.mean(inverse, axis=0)), np.asarray(share))
     variance = reference.noise**2 * (1.0 / len(frames) + 1.0 / reference.frames) + _FLOOR_PER_M**2
@@ -327,10 +327,7 @@ def _off(
     """
     points = reference.points
     there = transform(invert(se3_exp(xi)), points)
-    K = reference.camera.K
-    shift = there[..., :2] / there[..., 2:] - points[..., :2] / points[..., 2:]
-    x = (reference.columns + K[0, 0] * shift[..., 0]).astype(np.float32)
-    y = (reference.rows + K[1, 1] * shift[..., 1]).astype(np.float32)
+    x, y = np.moveaxis(project(reference.camera, there).astype(np.float32), -1, 0)
     surface, with_gaps = (cv2.remap(image, x, y, cv2.INTER_LINEAR) for image in now)
     seen = np.where(reference.outline, with_gaps, surface)
     nearer = reference.visible * (1.0 / there[..., 2] - 1.0 / points[..., 2])

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.detect.scene import Image, smoothed, static_view
+from station.calibration.detect.scene import smoothed, static_view
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
+from station.core.depth_image import Image
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be looked at first: station calibrate floor"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from station.calibration.detect.ball_image import ball_inverse_depth
 from station.calibration.detect.detections import FLOOR
 from station.calibration.solve import depth_correction
 from station.calibration.solve.problem import (
@@ -54,30 +55,6 @@ MEDIAN = 2.366
 """Of the squared deviation of three numbers."""
 
 
-def ball_inverse_depth(center: Array, ray: Array, radius_m: float) -> tuple[Array, Array]:
-    """Inverse depth (n, k) of balls (n, 3) along rays (n, k, 2), derivative (n, k, 3) by centre.
-
-    See ``station.calibration.detect.ball``; rays that miss are taken as if they touched.
-    """
-    x, y = ray[..., 0], ray[..., 1]
-    cx, cy, cz = (center[:, None, i] for i in range(3))
-    A = x * x + y * y + 1.0
-    B = x * cx + y * cy + cz
-    C = cx * cx + cy * cy + cz * cz - radius_m**2
-    s = np.sqrt(np.maximum(B * B - A * C, 1e-4 * B * B * radius_m**2))
-    w = (B + s) / C
-    k, j = B / s, A / s
-    gradient = np.stack(
-        [
-            (x + k * x - j * cx) / C - 2.0 * w * cx / C,
-            (y + k * y - j * cy) / C - 2.0 * w * cy / C,
-            (1.0 + k - j * cz) / C - 2.0 * w * cz / C,
-        ],
-        axis=-1,
-    )
-    return w, gradient
-
-
 def local_equations(
     seen: Sightings, centers: Array, correction: Array, radius_m: float
 ) -> tuple[Array, Array]:
@@ -86,7 +63,7 @@ def local_equations(
     measured = w - depth_correction.design(w, seen.place) @ correction
     design = depth_correction.design(measured, seen.place)
     residual = seen.inverse + design @ correction - w
-    rows = np.concatenate([-gradient, design], axis=-1)
+    rows = np.concatenate([-gradient[..., :3], design], axis=-1)
     weighted = rows * seen.weight[..., None]
     return (
         np.swapaxes(weighted, 1, 2) @ rows,

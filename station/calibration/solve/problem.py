@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +12,7 @@ from station.calibration.detect.detections import FLOOR, BallDetection, PlaneObs
 from station.calibration.solve import depth_correction
 from station.calibration.solve.trajectory import TimeGrid
 from station.core.geometry import se3_exp
+from station.core.lens import pixel_rays
 from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Sightings:
             camera=camera.name,
             times_s=np.array([detection.time_s for detection in detections]),
             centers=np.array([detection.center_m for detection in detections]).reshape(-1, 3),
-            ray=_rays(camera, patches),
+            ray=pixel_rays(camera, patches[..., :2]),
             inverse=patches[..., 2],
             weight=1.0 / patches[..., 3],
             place=depth_correction.image_place(camera, patches[..., :2]),
@@ -80,7 +80,9 @@ class Surface:
     @classmethod
     def of(cls, camera: CameraCalibration, seen: PlaneObservation, name: str) -> Surface:
         patches = seen.patches
-        ray = np.concatenate([_rays(camera, patches), np.ones((len(patches), 1))], axis=1)
+        ray = np.concatenate(
+            [pixel_rays(camera, patches[:, :2]), np.ones((len(patches), 1))], axis=1
+        )
         weight = 1.0 / patches[:, 3]
         m = np.linalg.solve(ray.T @ (ray * weight[:, None]), ray.T @ (weight * patches[:, 2]))
         place = depth_correction.image_place(camera, patches[:, :2])
@@ -190,13 +192,3 @@ def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> 
         places={name: at + step[layout.triple(name)] for name, at in state.places.items()},
         planes={name: q + step[layout.triple(name)] for name, q in state.planes.items()},
     )
-
-
-def _rays(camera: CameraCalibration, patches: Array) -> Array:
-    """(..., 2): x, y of the rays (x, y, 1) through the patches' middles, the lens undone."""
-    if not camera.distortion.any():
-        K = camera.K
-        return np.asarray((patches[..., :2] - (K[0, 2], K[1, 2])) / (K[0, 0], K[1, 1]))
-    flat = patches[..., :2].reshape(-1, 1, 2)
-    undone = cv2.undistortPoints(flat, camera.K, camera.distortion)
-    return np.asarray(undone.reshape((*patches.shape[:-1], 2)), np.float64)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.detections import FLOOR
 from station.calibration.solve.problem import Layout, Problem, State, moved_state
-from station.core.geometry import invert, rigid, skew, so3_log
+from station.core.geometry import adjoint, invert, rigid, twist_between
 
 Array = NDArray[np.float64]
 
@@ -89,12 +89,6 @@ def _slope_sigma(layout: Layout, state: State) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def twist_between(pose: Array, other: Array) -> Array:
-    """xi (6,) of other = pose @ se3_exp(xi)."""
-    difference = invert(pose) @ other
-    return np.concatenate([so3_log(difference[:3, :3]), difference[:3, 3]])
-
-
 def relatives(placed: Placed, a: str, others: Sequence[str]) -> tuple[list[Array], Array]:
     """a_from_b (4, 4) of each other camera b, and the covariance (6 k, 6 k) of all their xi.
 
@@ -109,7 +103,7 @@ def relatives(placed: Placed, a: str, others: Sequence[str]) -> tuple[list[Array
         a_from_b = invert(placed.world_from_camera[a]) @ placed.world_from_camera[b]
         rows = np.s_[6 * row : 6 * row + 6]
         # exp(-xi_a) a_from_b exp(xi_b): what stands on the left is carried to the right side.
-        select[rows, 6 * i : 6 * i + 6] -= _adjoint(invert(a_from_b))
+        select[rows, 6 * i : 6 * i + 6] -= adjoint(invert(a_from_b))
         select[rows, 6 * j : 6 * j + 6] += np.eye(6)
         found.append(a_from_b)
     return found, select @ placed.covariance @ select.T
@@ -130,15 +124,6 @@ def sigma_to(placed: Placed, reference: str, name: str) -> tuple[float, float]:
         float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
         float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),
     )
-
-
-def _adjoint(b_from_a: Array) -> Array:
-    """(6, 6): a small xi (rotation, translation) of frame a as one of frame b."""
-    rotation, shift = b_from_a[:3, :3], b_from_a[:3, 3]
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = matrix[3:, 3:] = rotation
-    matrix[3:, :3] = skew(shift) @ rotation
-    return matrix
 
 
 def _above(state: State, point: Array) -> float:
