@@ -20,7 +20,7 @@ demo: $(VENV)/runtime.stamp
 	$(BIN)/python deploy/demo.py --folder $(DEMO)
 
 test: $(VENV)/train.stamp
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --durations=20
 
 check: $(VENV)/train.stamp
 	$(BIN)/ruff check .

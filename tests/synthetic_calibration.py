@@ -49,8 +49,9 @@ def booth(seed: int, bias_m: float = 0.015) -> SimulatedBooth:
         for name, camera in rig.cameras.items()
     }
     rig = replace(rig, cameras=cameras)
-    uneven = {"uneven_floor_m": 5e-4, "uneven_board_m": 2e-4}
-    return SimulatedBooth(rig=rig, seed=seed, bias_m=bias_m, **uneven)
+    return SimulatedBooth(
+        rig=rig, seed=seed, bias_m=bias_m, uneven_floor_m=5e-4, uneven_board_m=2e-4
+    )
 
 
 def factory(rig: Rig) -> dict[str, CameraCalibration]:
@@ -72,7 +73,10 @@ def observations(
     procedure: VirtualProcedure, *, rate_hz: float = 10.0, clock_error_s: float = 0.0
 ) -> Observations:
     """A whole calibration's detections."""
-    waved, mark, front, planes = [], [], [], []
+    waved: list[BallDetection] = []
+    mark: list[BallDetection] = []
+    front: list[BallDetection] = []
+    planes = []
     beside = [(f"{AROUND}-{i}", at) for i, at in enumerate(procedure.around_m)]
     around: dict[str, list[BallDetection]] = {step: [] for step, _ in beside}
     start_s = procedure.starts_s(BALL)
@@ -88,8 +92,8 @@ def observations(
         places = [(low, mark), (low - (0.0, procedure.front_m, 0.0), front)]
         places += [(np.array([x, y, low[2]]), around[step]) for step, (x, y) in beside]
         for place, found in places:
-            seen = [_ball(camera, unit, place, procedure, rng) for _ in range(15)]
-            found += [detection for detection in seen if detection is not None]
+            looks = [_ball(camera, unit, place, procedure, rng) for _ in range(15)]
+            found += [detection for detection in looks if detection is not None]
         planes.append(_floor(camera, unit, rng))
     return Observations(
         waved, mark, front, [plane for plane in planes if plane is not None], around
@@ -158,7 +162,7 @@ def _ball(
         sightings = Sightings.of(camera, [seen])
         correction = np.zeros(depth_correction.PARAMETERS)
         normal, pull = local_equations(sightings, seen.center_m[None], correction, radius)
-        covariance = np.linalg.inv(normal[0, :3, :3])
+        covariance: Array = np.linalg.inv(normal[0, :3, :3]).astype(np.float64)
         seen = replace(
             seen, center_m=seen.center_m - covariance @ pull[0, :3], covariance_m2=covariance
         )

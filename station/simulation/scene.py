@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from station.core.errors import InputError
 from station.core.geometry import rigid, se3_exp, transform
@@ -65,10 +65,12 @@ def load_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def sphere(center_m: Sequence[float], radius_m: float) -> Mesh:
+def sphere(center_m: ArrayLike, radius_m: float) -> Mesh:
     """A ball."""
     shape = o3d.geometry.TriangleMesh.create_sphere(radius_m, 40)
-    return Mesh(np.asarray(shape.vertices) + center_m, np.asarray(shape.triangles, np.int32))
+    return Mesh(
+        np.asarray(shape.vertices) + np.asarray(center_m), np.asarray(shape.triangles, np.int32)
+    )
 
 
 def box(low_m: Sequence[float], high_m: Sequence[float]) -> Mesh:

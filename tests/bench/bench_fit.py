@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -127,10 +127,11 @@ def peers_of(row: Row, model: BodyModel, scan: Preprocessed) -> list[PeerRow]:
     """The paper's method and nricp_amberg on a cloud that was fitted already."""
     assert row.case.body is not None
     found = []
-    for name, peer in (
-        ("paper", lambda: fit_body(model, scan, method="paper").vertices),
-        ("nricp_amberg", lambda: nricp(model, scan)),
-    ):
+    peers: dict[str, Callable[[], Array]] = {
+        "paper": lambda: fit_body(model, scan, method="paper").vertices,
+        "nricp_amberg": lambda: nricp(model, scan),
+    }
+    for name, peer in peers.items():
         start_s = time.perf_counter()
         vertices = peer()
         took_s = time.perf_counter() - start_s
@@ -221,7 +222,7 @@ def run_worker(bundle: Path, out: Path, threads: int | None) -> WorkerRun:
 
 def workers(bundle: Path, folder: Path) -> tuple[float, int]:
     """Peak memory in MB of a worker, and how many different meshes come of 1, 2 and 4 threads."""
-    runs = {None: run_worker(bundle, folder / "worker", None)}
+    runs: dict[int | None, WorkerRun] = {None: run_worker(bundle, folder / "worker", None)}
     print(f"\na worker's process: peak {runs[None].peak_mb:.0f} MB")
     for threads in _THREADS:
         runs[threads] = run_worker(bundle, folder / f"worker-{threads}", threads)

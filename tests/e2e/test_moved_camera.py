@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from running_station import Station
 
 from station.calibration.detect.scene import static_view
 from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
@@ -63,7 +64,7 @@ def _recorded(text: str) -> str:
 
 
 def test_a_scan_is_refused_when_a_camera_has_moved(
-    make_station: Callable[..., object], booth: Path, bumped: Path, calibrated: Path
+    make_station: Callable[..., Station], booth: Path, bumped: Path, calibrated: Path
 ) -> None:
     station = make_station(
         "[workers]\ncount = 0",
@@ -76,7 +77,7 @@ def test_a_scan_is_refused_when_a_camera_has_moved(
     assert "camera front-upper has moved since it was calibrated" in done.stderr
     assert "station calibrate" in done.stderr
     assert not any(name in done.stderr for name in ("front-lower", "back-lower", "back-upper"))
-    assert not list((station.core.config.parent / "spool/queue").iterdir())
+    assert not list((station.config.parent / "spool/queue").iterdir())
     checked = station.command("check")
     assert checked.returncode == 3
     assert "camera front-upper has moved" in checked.stdout
@@ -85,7 +86,7 @@ def test_a_scan_is_refused_when_a_camera_has_moved(
 
 
 def test_a_scan_is_accepted_when_none_has(
-    make_station: Callable[..., object], calibrated: Path
+    make_station: Callable[..., Station], calibrated: Path
 ) -> None:
     station = make_station("[workers]\ncount = 0", _recorded)
     assert calibrated.exists()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from running_station import Station
 
 from station.calibration.guide.session import Session
 from station.core.errors import DriverError
@@ -82,13 +83,13 @@ def test_a_booth_is_calibrated_from_replayed_recordings(recorded: Path) -> None:
     assert "does not look as it did" not in checked.stdout
 
 
-def test_live_cameras_are_looked_at_like_recordings(make_station: Callable[..., object]) -> None:
+def test_live_cameras_are_looked_at_like_recordings(make_station: Callable[..., Station]) -> None:
     station = make_station(
         "[workers]\ncount = 0", lambda text: text.replace("freenect", "recorded")
     )
     done = station.command("calibrate", "floor", "--yes")
     assert done.returncode == 0, done.stderr
     assert "empty booth kept" in done.stdout
-    session = Session.load(station.core.config.parent / "calibrations/unfinished")
+    session = Session.load(station.config.parent / "calibrations/unfinished")
     assert set(session.cameras) == {"front-lower", "front-upper", "back-lower", "back-upper"}
     assert session.background("back-upper") is not None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from running_station import Station
 
 from station.core.errors import DriverError
 from station.sensors.freenect import find_library
@@ -40,7 +41,9 @@ def _surface_rms_m(result: Path, body: str) -> float:
 
 
 @needs_replay
-def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..., object]) -> None:
+def test_a_scan_through_libfreenect_is_delivered_whole(
+    make_station: Callable[..., Station],
+) -> None:
     station = make_station()
     started = station.command("start")
     assert started.returncode == 0, started.stderr
@@ -48,7 +51,7 @@ def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..
     done = station.command("scan", "--label", "Order 7", "--scan-id", "20260101T000000Z-0001")
     assert done.returncode in (0, 3), done.stderr + station.log.read_text()
     assert "the person may leave" in done.stdout or "reconstructing" in done.stdout
-    result = station.core.config.parent / "spool/outbox/20260101T000000Z-0001"
+    result = station.config.parent / "spool/outbox/20260101T000000Z-0001"
     assert str(result) in done.stdout
     document = json.loads((result / "result.json").read_text())
     for name, digest in document["files"].items():
@@ -56,7 +59,7 @@ def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..
     assert _surface_rms_m(result, "ann") < 0.008
     again = station.command("scan", "--scan-id", "20260101T000000Z-0001")
     assert again.returncode == done.returncode
-    spool = station.core.config.parent / "spool"
+    spool = station.config.parent / "spool"
     assert [entry.name for entry in (spool / "outbox").iterdir()] == ["20260101T000000Z-0001"]
     bundle = json.loads((spool / "done/20260101T000000Z-0001/bundle.json").read_text())
     assert bundle["label"] == "Order 7"
@@ -68,7 +71,7 @@ def test_a_scan_through_libfreenect_is_delivered_whole(make_station: Callable[..
 
 
 @needs_replay
-def test_killed_processes_lose_no_scan(make_station: Callable[..., object]) -> None:
+def test_killed_processes_lose_no_scan(make_station: Callable[..., Station]) -> None:
     """kill -9 of a capture process, of the job mid-fit: the scan is delivered exactly once."""
     station = make_station()
     assert station.command("start").returncode == 0
@@ -84,7 +87,7 @@ def test_killed_processes_lose_no_scan(make_station: Callable[..., object]) -> N
     assert station.command("start").returncode == 0
     taken = station.command("scan", "--no-wait", "--scan-id", "20260101T000000Z-0002")
     assert taken.returncode == 0, taken.stderr
-    spool = station.core.config.parent / "spool"
+    spool = station.config.parent / "spool"
     station.wait_until(
         lambda: (spool / "work/20260101T000000Z-0002").exists(), "a worker claims it"
     )
@@ -99,7 +102,7 @@ def test_killed_processes_lose_no_scan(make_station: Callable[..., object]) -> N
 
 
 @needs_replay
-def test_a_lost_recording_names_the_camera(make_station: Callable[..., object]) -> None:
+def test_a_lost_recording_names_the_camera(make_station: Callable[..., Station]) -> None:
     station = make_station(change=lambda text: text.replace("/front-upper", "/nowhere"))
     started = station.command("start", "--timeout", "4")
     assert started.returncode == 1
@@ -113,17 +116,17 @@ def test_a_lost_recording_names_the_camera(make_station: Callable[..., object]) 
 
 
 @needs_replay
-def test_a_full_disk_refuses_before_the_scan(make_station: Callable[..., object]) -> None:
+def test_a_full_disk_refuses_before_the_scan(make_station: Callable[..., Station]) -> None:
     station = make_station("[spool]\nmin_free_mb = 1e9")
     assert station.command("start").returncode == 0
     refused = station.command("scan")
     assert refused.returncode == 1
     assert "MB free" in refused.stderr
-    assert not list((station.core.config.parent / "spool/queue").iterdir())
+    assert not list((station.config.parent / "spool/queue").iterdir())
 
 
 @needs_replay
-def test_sync_killed_in_a_scan_is_reported_as_failed(make_station: Callable[..., object]) -> None:
+def test_sync_killed_in_a_scan_is_reported_as_failed(make_station: Callable[..., Station]) -> None:
     """The operator once waited for ever for a scan that nobody was collecting any more."""
     station = make_station("[scan]\nframesets = 60\nmax_duration_s = 3.0\n[workers]\ncount = 0")
     assert station.command("start").returncode == 0

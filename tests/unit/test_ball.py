@@ -135,7 +135,7 @@ def test_a_person_who_waves_it_is_not_taken_for_it(procedure: VirtualProcedure) 
             truth = transform(
                 invert(camera.world_from_camera), procedure.ball_center_m(frame.time_s)
             )
-            near = np.linalg.norm(seen.center_m - truth) < 0.02
+            near = bool(np.linalg.norm(seen.center_m - truth) < 0.02)
             right, wrong = right + near, wrong + (not near)
     assert right >= 10
     assert wrong <= 0.2 * right

@@ -128,7 +128,7 @@ def test_the_ball_shows_a_floor_that_no_camera_sees(
     for name, camera in procedure.booth.rig.cameras.items():
         ours = solution.rig.cameras[name].world_from_camera
         up, true_up = ours[2, :3], camera.world_from_camera[2, :3]
-        assert np.degrees(np.arccos(min(up @ true_up, 1.0))) < 0.1
+        assert np.degrees(np.arccos(min(float(up @ true_up), 1.0))) < 0.1
         assert abs(ours[2, 3] - camera.world_from_camera[2, 3]) < 4e-3
     assert solution.placed.slope_sigma_rad < np.radians(0.08)
 

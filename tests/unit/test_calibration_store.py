@@ -198,12 +198,13 @@ def test_advice_names_what_is_missing() -> None:
             )
     assert coverage.ties()["front-lower"] == ("front-upper", 400)
     assert coverage.ties()["back-lower"][1] == 0
-    assert not coverage.enough
+    enough_with_half = coverage.enough
     for moment in range(400, 800):
         for index, name in enumerate(CAMERAS):
             x, y, z = rng.uniform((-0.5, -0.4, 1.2), (0.5, 0.4, 2.2))
             coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (x, y, z)))
     assert coverage.enough
+    assert not enough_with_half
     assert coverage.share == 1.0
     assert coverage.advice() == "everything is covered"
 

@@ -10,7 +10,9 @@ from station.calibration.solve.pairwise import Track, relate_all
 def track(times_s: np.ndarray, late_s: np.ndarray | float = 0.0) -> Track:
     """Of a ball that is waved slowly, as a clock that is late tells it."""
     turns = 2.0 * np.pi * np.outer(times_s, (0.06, 0.04, 0.05))
-    return Track(times_s + late_s, (0.5, 0.4, 0.7) * np.sin(turns) + (0.0, 0.0, 1.7))
+    return Track(
+        np.asarray(times_s + late_s), np.array((0.5, 0.4, 0.7)) * np.sin(turns) + (0.0, 0.0, 1.7)
+    )
 
 
 def seen(start_s: float, end_s: float) -> np.ndarray:

@@ -1,17 +1,16 @@
 """The table of measurements on bodies of the model itself: no fit, no noise."""
 
 import csv
-import importlib.util
 import io
 import json
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from true_measurements import TrueBody
 
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
@@ -52,16 +51,6 @@ def _values(model: BodyModel, vertices: np.ndarray) -> dict[str, float]:
     return {row.name: row.value_m for row in measure_body(model, vertices).rows}
 
 
-def _true_measurements() -> ModuleType:
-    path = Path(__file__).parents[1] / "bench/true_measurements.py"
-    spec = importlib.util.spec_from_file_location("true_measurements", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_table_names_only_what_the_model_has(model: BodyModel) -> None:
     assert len({definition.name for definition in DEFINITIONS}) == len(DEFINITIONS) >= 60
     for definition in DEFINITIONS:
@@ -73,7 +62,7 @@ def test_the_table_names_only_what_the_model_has(model: BodyModel) -> None:
 
 
 def test_the_model_carries_the_landmarks_that_the_rules_find(model: BodyModel) -> None:
-    found = find_landmarks(model.mean, list(model.part_names), model.part_of_vertex)
+    found = find_landmarks(model.mean, list(model.part_names), model.part_of_vertex.astype(np.intp))
     assert found == model.landmarks
 
 
@@ -92,7 +81,7 @@ def test_landmarks_lie_where_surveys_find_them(model: BodyModel) -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_independent_measuring_finds_the_same(model: BodyModel, seed: int) -> None:
     _, vertices = _body(model, seed)
-    truth = _true_measurements().TrueBody(model, vertices).values()
+    truth = TrueBody(model, vertices).values()
     for name, value in _values(model, vertices).items():
         assert value == pytest.approx(truth[name], abs=5e-4), name
     measured = measure_body(model, vertices)

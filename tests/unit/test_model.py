@@ -42,7 +42,8 @@ def test_the_jacobian_is_the_derivative(model: BodyModel) -> None:
     state = _some_state(model)
     samples = SampledBody.build(model, np.arange(0, model.vertex_count, 211))
     before, derivative = samples.jacobian(state)
-    delta = 1e-4 * np.random.default_rng(1).standard_normal(derivative.shape[2])
+    delta = np.full(derivative.shape[2], 1e-4)
+    delta *= np.random.default_rng(1).standard_normal(len(delta))
     parts = 3 * model.part_count
     moved = BodyState(
         so3_exp(delta[:parts].reshape(-1, 3)) @ state.rotations,

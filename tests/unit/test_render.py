@@ -77,7 +77,9 @@ def test_what_is_in_front_hides_what_is_behind() -> None:
 
 
 def _decoded(content: bytes) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture
 
 
 def test_labels_keep_clear_of_the_body_and_of_each_other(
