@@ -8,20 +8,15 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, SerializeAsAny, ValidationError, model_validator
 
+from station.core.drivers import BASE_FOLDER, AnyCamera, CameraConfig, ConfigPath, Strict
 from station.core.errors import ConfigError
 
 DEFAULT_PATH = Path("booth.toml")
 ENVIRONMENT_VARIABLE = "BOOTH_CONFIG"
-
-
-def _plain_name(name: str) -> str:
-    if not name or not all(c.isalnum() or c in "-_" for c in name) or not name.isascii():
-        raise ValueError("use letters, digits, '-' and '_' only")
-    return name
 
 
 _SMALLEST_BALL_M = 0.07
@@ -37,40 +32,10 @@ def _found_afar(radius_m: float) -> float:
     return radius_m
 
 
-Name = Annotated[str, AfterValidator(_plain_name)]
 Metres3 = tuple[float, float, float]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class CameraConfig(_Strict):
-    """One sensor and the driver that reads it."""
-
-    name: Name = Field(description="the camera's name in the calibration and in every message")
-    driver: Literal["freenect", "recorded", "virtual"] = Field(description="how it is read")
-    serial: str = Field(default="", description="the sensor's serial number (freenect)")
-    recording: Path | None = Field(
-        default=None,
-        description="a recording folder (INDEX.txt): replayed through libfreenect's replay "
-        "library (freenect) or read without it (recorded)",
-    )
-    body: Path | None = Field(default=None, description="the virtual person's mesh (virtual)")
-    seed: int = Field(default=0, ge=0, description="of the simulated noise and clock (virtual)")
-
-    @model_validator(mode="after")
-    def _has_a_source(self) -> Self:
-        if self.driver == "recorded" and self.recording is None:
-            raise ValueError(f"camera {self.name}: driver recorded needs the key recording")
-        if self.driver == "freenect" and not self.serial and self.recording is None:
-            raise ValueError(f"camera {self.name}: driver freenect needs serial or recording")
-        if self.driver == "virtual" and self.body is None:
-            raise ValueError(f"camera {self.name}: driver virtual needs the key body")
-        return self
-
-
-class VolumeConfig(_Strict):
+class Volume(Strict):
     """The part of the world in which a body is looked for, metres."""
 
     min_m: Metres3 = (-0.95, -0.75, 0.0)
@@ -86,7 +51,7 @@ class VolumeConfig(_Strict):
         return self
 
 
-class SyncConfig(_Strict):
+class SyncConfig(Strict):
     """How frames of the cameras are matched."""
 
     tolerance_s: float = Field(default=0.025, gt=0.0, le=0.5, description="a set's widest spread")
@@ -96,7 +61,7 @@ class SyncConfig(_Strict):
     live_hz: float = Field(default=3.0, gt=0.0, le=30.0, description="rate of the live cloud")
 
 
-class ScanConfig(_Strict):
+class ScanConfig(Strict):
     """What one scan takes."""
 
     framesets: int = Field(default=10, ge=1, le=100)
@@ -105,10 +70,10 @@ class ScanConfig(_Strict):
     )
 
 
-class CalibrateConfig(_Strict):
+class CalibrateConfig(Strict):
     """How the booth is calibrated."""
 
-    folder: Path = Field(default=Path("calibrations"), description="all dated calibrations")
+    folder: ConfigPath = Field(default=Path("calibrations"), description="all dated calibrations")
     ball_radius_m: Annotated[float, AfterValidator(_found_afar)] = Field(default=0.1, le=0.3)
     reference: str = Field(default="", description="the camera that the others are tied to first")
     front: tuple[str, ...] = Field(
@@ -122,7 +87,7 @@ class CalibrateConfig(_Strict):
     )
 
 
-class DriftConfig(_Strict):
+class DriftConfig(Strict):
     """Whether cameras still stand where they were calibrated."""
 
     refuse_scans: bool = Field(
@@ -130,14 +95,14 @@ class DriftConfig(_Strict):
     )
 
 
-class SpoolConfig(_Strict):
+class SpoolConfig(Strict):
     """Where scans and results lie; one local file system (file locks and renames)."""
 
-    folder: Path = Path("spool")
+    folder: ConfigPath = Path("spool")
     min_free_mb: float = Field(default=500.0, ge=0.0, description="a scan is refused below this")
 
 
-class WorkersConfig(_Strict):
+class WorkersConfig(Strict):
     """The reconstruction workers."""
 
     count: int = Field(default=1, ge=0, le=64)
@@ -146,35 +111,42 @@ class WorkersConfig(_Strict):
     retries: int = Field(default=2, ge=0, le=10, description="tries after the first failure")
 
 
-class RetentionConfig(_Strict):
+class RetentionConfig(Strict):
     """Body scans are personal data: how long they are kept, days."""
 
     raw_days: float = Field(default=7.0, ge=0.0, description="bundles of delivered scans")
     result_days: float = Field(default=30.0, ge=0.0, description="results and failed scans")
 
 
-class RuntimeConfig(_Strict):
+class RuntimeConfig(Strict):
     """Sockets and logs."""
 
-    folder: Path = Field(default=Path("run"), description="ipc sockets, created with mode 0700")
+    folder: ConfigPath = Field(
+        default=Path("run"), description="ipc sockets, created with mode 0700"
+    )
     command_timeout_s: float = Field(default=5.0, gt=0.0, le=60.0)
 
 
-class BoothConfig(_Strict):
+def _section() -> Any:
+    """A section that may be left out: its defaults are validated too, so paths are resolved."""
+    return Field(default_factory=dict)
+
+
+class BoothConfig(Strict):
     """A whole booth."""
 
     version: Literal[1] = 1
-    cameras: tuple[CameraConfig, ...] = Field(min_length=1)
-    calibration: Path = Path("calibration.json")
-    volume: VolumeConfig = VolumeConfig()
-    sync: SyncConfig = SyncConfig()
-    scan: ScanConfig = ScanConfig()
-    calibrate: CalibrateConfig = CalibrateConfig()
-    drift: DriftConfig = DriftConfig()
-    spool: SpoolConfig = SpoolConfig()
-    workers: WorkersConfig = WorkersConfig()
-    retention: RetentionConfig = RetentionConfig()
-    runtime: RuntimeConfig = RuntimeConfig()
+    cameras: tuple[SerializeAsAny[CameraConfig], ...] = Field(min_length=1)
+    calibration: ConfigPath = Path("calibration.json")
+    volume: Volume = _section()
+    sync: SyncConfig = _section()
+    scan: ScanConfig = _section()
+    calibrate: CalibrateConfig = _section()
+    drift: DriftConfig = _section()
+    spool: SpoolConfig = _section()
+    workers: WorkersConfig = _section()
+    retention: RetentionConfig = _section()
+    runtime: RuntimeConfig = _section()
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
@@ -234,53 +206,52 @@ def load_config(path: Path) -> BoothConfig:
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
         raise ConfigError(f"{path} is not TOML: {cause}") from None
+    base = {BASE_FOLDER: path.resolve().parent}
     try:
-        config = BoothConfig.model_validate(document)
+        cameras = document.get("cameras")
+        if isinstance(cameras, list):
+            document["cameras"] = [
+                _camera(section, index, base) for index, section in enumerate(cameras)
+            ]
+        return _validated(BoothConfig, document, (), base)
+    except ConfigError as cause:
+        raise ConfigError(f"{path}: {cause}") from None
+
+
+Section = TypeVar("Section", bound=Strict)
+_Place = tuple[str | int, ...]
+
+
+def _camera(section: Any, index: int, base: dict[str, Path]) -> CameraConfig:
+    """A camera's section, checked by the class of its driver."""
+    place = ("cameras", index)
+    named = _validated(AnyCamera, section, place, base)
+    try:
+        model = named.of_its_driver()
+    except ConfigError as cause:
+        raise ConfigError(f"{_key((*place, 'driver'))}: {cause}") from None
+    return _validated(model, section, place, base)
+
+
+def _validated(model: type[Section], document: Any, place: _Place, base: Any) -> Section:
+    try:
+        return model.model_validate(document, context=base)
     except ValidationError as cause:
-        raise ConfigError(f"{path}: {_first_problem(cause)}") from None
-    return _with_absolute_paths(config, path.resolve().parent)
+        raise ConfigError(_first_problem(cause, model, place)) from None
 
 
-def _first_problem(cause: ValidationError) -> str:
+def _key(place: _Place) -> str:
+    return ".".join(str(part) for part in place) or "the file"
+
+
+def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -> str:
     """One line for the first error: the key, what is wrong, what is allowed."""
     problem = cause.errors()[0]
-    key = ".".join(str(part) for part in problem["loc"]) or "the file"
+    key = _key((*place, *problem["loc"]))
     if problem["type"] == "extra_forbidden":
-        model: Any = BoothConfig
+        section: Any = model
         for part in problem["loc"][:-1]:
-            if isinstance(part, str):
-                model = _section(model, part)
-        allowed = ", ".join(model.model_fields)
-        return f"unknown key {key}; allowed here: {allowed}"
+            section = section.model_fields[part].annotation
+        return f"unknown key {key}; allowed here: {', '.join(section.model_fields)}"
     message = problem["msg"].removeprefix("Value error, ")
     return f"{key}: {message} (found {problem['input']!r:.80})"
-
-
-def _section(model: Any, key: str) -> Any:
-    """The model of a nested section, also of one in a tuple (cameras)."""
-    annotation: Any = model.model_fields[key].annotation
-    return next(iter(getattr(annotation, "__args__", ())), annotation)
-
-
-def _with_absolute_paths(config: BoothConfig, base: Path) -> BoothConfig:
-    cameras = tuple(
-        camera.model_copy(
-            update={
-                key: base / value
-                for key in ("recording", "body")
-                if (value := getattr(camera, key)) is not None
-            }
-        )
-        for camera in config.cameras
-    )
-    return config.model_copy(
-        update={
-            "cameras": cameras,
-            "calibration": base / config.calibration,
-            "calibrate": config.calibrate.model_copy(
-                update={"folder": base / config.calibrate.folder}
-            ),
-            "spool": config.spool.model_copy(update={"folder": base / config.spool.folder}),
-            "runtime": config.runtime.model_copy(update={"folder": base / config.runtime.folder}),
-        }
-    )

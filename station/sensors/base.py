@@ -1,6 +1,7 @@
 """What every depth sensor driver gives, whatever the sensor.
 
-A driver adds itself to ``station.sensors.registry``; nothing else has to know it.
+A driver is a class with these three methods, made from its camera's section of booth.toml. It is
+found through an entry point, see `station.core.drivers`; nothing else has to know it.
 """
 
 from __future__ import annotations

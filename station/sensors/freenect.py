@@ -13,11 +13,13 @@ import queue
 import threading
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
 from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.raw11 import TABLE
@@ -87,12 +89,35 @@ def find_library(*, replay: bool) -> Path:
     )
 
 
+class FreenectCamera(CameraConfig):
+    """A Kinect v1 by its serial number, or a recording played by libfreenect's replay library."""
+
+    driver: str = "freenect"
+    serial: str = Field(default="", description="the sensor's serial number")
+    recording: ConfigPath | None = Field(
+        default=None, description="a recording folder (INDEX.txt) to play instead of a sensor"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_source(self) -> Self:
+        if not self.serial and self.recording is None:
+            raise ValueError("the driver freenect needs the key serial or recording")
+        return self
+
+    def replaying(self, recording: Path) -> CameraConfig:
+        return self.model_copy(update={"recording": recording})
+
+
 class FreenectDriver:
     """One Kinect v1 by serial, or one recording by folder (one a process)."""
 
-    def __init__(self, serial: str, recording: Path | None = None) -> None:
-        self._serial, self._recording = serial, recording
-        self._name = f"recording {recording}" if recording else f"Kinect {serial}"
+    Config = FreenectCamera
+
+    def __init__(self, camera: FreenectCamera) -> None:
+        self._serial, self._recording = camera.serial, camera.recording
+        self._name = (
+            f"recording {camera.recording}" if camera.recording else f"Kinect {camera.serial}"
+        )
         self._library: ctypes.CDLL | None = None
         self._context, self._device = ctypes.c_void_p(), ctypes.c_void_p()
         self._frames: queue.Queue[_Arrival] = queue.Queue(_WAITING_FRAMES)

@@ -6,7 +6,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 
+from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
 from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
@@ -32,11 +34,24 @@ def kinect_v1(serial: str) -> DeviceInfo:
     )
 
 
+class RecordedCamera(CameraConfig):
+    """A camera whose recording is read from disk, without libfreenect."""
+
+    driver: str = "recorded"
+    recording: ConfigPath = Field(description="a recording folder (INDEX.txt)")
+    serial: str = Field(default="", description="the serial number it is said to have")
+
+    def replaying(self, recording: Path) -> CameraConfig:
+        return self.model_copy(update={"recording": recording})
+
+
 class RecordedDriver:
     """Plays a recording folder; after the last frame it starts over, as a replayed sensor does."""
 
-    def __init__(self, recording: Path, serial: str = "") -> None:
-        self._recording, self._serial = recording, serial
+    Config = RecordedCamera
+
+    def __init__(self, camera: RecordedCamera) -> None:
+        self._recording, self._serial = camera.recording, camera.serial
         self._frames: list[tuple[float, int, Path]] = []
         self._sequence = 0
         self._start_s = 0.0

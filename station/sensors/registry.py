@@ -1,23 +1,16 @@
-"""Which driver a camera's configuration names."""
+"""The driver that a camera's configuration names, as an object."""
 
 from __future__ import annotations
 
-from station.core.config import CameraConfig
+from station.core.drivers import CameraConfig, driver_class
 from station.sensors.base import DepthDriver
 
 
 def make_driver(camera: CameraConfig) -> DepthDriver:
-    """The driver of a camera, not yet opened; only the one in use is imported."""
-    if camera.driver == "freenect":
-        from station.sensors.freenect import FreenectDriver
+    """The driver of a camera, not yet opened.
 
-        return FreenectDriver(camera.serial, camera.recording)
-    if camera.driver == "recorded":
-        from station.sensors.recorded import RecordedDriver
-
-        assert camera.recording is not None
-        return RecordedDriver(camera.recording, camera.serial)
-    from station.simulation.sensor import VirtualDriver
-
-    assert camera.body is not None
-    return VirtualDriver(camera.name, camera.body, camera.seed)
+    Raises:
+        ConfigError: no driver of that name is installed.
+    """
+    driver: DepthDriver = driver_class(camera.driver)(camera)
+    return driver

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.bundle import CapturedFrame, write_bundle
-from station.core.errors import DriverError, InputError
+from station.core.errors import InputError
 from station.core.rig import Rig
-from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import RecordedFrame
 from station.simulation.noise import TrueView, UnitError, observe
@@ -22,7 +20,6 @@ from station.simulation.scene import (
     VirtualScene,
     booth_walls,
     default_rig,
-    load_mesh,
     moved,
     uneven,
 )
@@ -34,7 +31,6 @@ FRAME_RATE_HZ = 30.0
 _SWAY_PERIOD_S = 3.1
 _LEAN_STEP_M = 0.00025
 """A view is rendered anew when the person leans by so much more: far below the sensor's noise."""
-_LIVE_LOOP_FRAMES = 24
 _FACTORY_SIGMA = (3e-4, 1.5e-3)
 """Gain and curvature of inverse depth among units that have depth errors at all."""
 
@@ -197,52 +193,3 @@ def recorded_frames(camera: VirtualCamera, count: int) -> Iterator[RecordedFrame
     """A camera's frames as a recording holds them."""
     for frame in camera.frames(count):
         yield RecordedFrame(frame.time_s, frame.ticks, frame.raw)
-
-
-class VirtualDriver:
-    """A simulated sensor in real time: a loop of frames is rendered once, then played."""
-
-    def __init__(self, name: str, body: Path, seed: int) -> None:
-        self._name, self._body, self._seed = name, body, seed
-        self._loop: list[VirtualFrame] = []
-        self._start_s = 0.0
-        self._sequence = 0
-
-    def open(self) -> DeviceInfo:
-        booth = SimulatedBooth(seed=self._seed)
-        if self._name not in booth.rig.cameras:
-            known = ", ".join(booth.rig.cameras)
-            raise DriverError(f"camera {self._name}: the virtual booth has only {known}")
-        camera = VirtualCamera(booth, self._name, load_mesh(self._body))
-        self._loop = list(camera.frames(_LIVE_LOOP_FRAMES))
-        self._unit = camera.unit
-        self._start_s = time.monotonic() + camera.unit.phase_s
-        self._sequence = 0
-        calibration = booth.rig.cameras[self._name]
-        return DeviceInfo(
-            serial=calibration.serial,
-            model="virtual",
-            width=calibration.width,
-            height=calibration.height,
-            K=calibration.K,
-            distortion=calibration.distortion,
-            depth_scale_m=DEPTH_SCALE_M,
-            tick_hz=TICK_HZ,
-            tick_bits=32,
-        )
-
-    def read(self, timeout_s: float) -> DepthFrame | None:
-        due_s = self._sequence / FRAME_RATE_HZ
-        wait_s = self._start_s + due_s - time.monotonic()
-        if wait_s > timeout_s:
-            time.sleep(timeout_s)
-            return None
-        time.sleep(max(wait_s, 0.0))
-        frame = self._loop[self._sequence % len(self._loop)]
-        ticks = self._unit.ticks(self._unit.phase_s + due_s)
-        result = DepthFrame(TABLE[frame.raw], ticks, time.monotonic(), self._sequence)
-        self._sequence += 1
-        return result
-
-    def close(self) -> None:
-        self._loop = []

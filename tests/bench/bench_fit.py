@@ -20,7 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +51,12 @@ from numpy.typing import NDArray
 from surface_errors import surface_errors
 
 from station.core.bundle import read_bundle
+from station.core.config import Volume
 from station.core.errors import BoothError
 from station.simulation.scene import Mesh
 from station.simulation.sensor import render_bundle
 from workers.cloud.observed import Preprocessed
-from workers.cloud.preprocess import Volume, preprocess
+from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import reconstruct_bundle, warm_up
 from workers.scape.fit.fit import fit_body, sampling_of
 from workers.scape.fit.initial import starting_states
@@ -200,7 +201,12 @@ print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, done.returncode)
 def run_worker(bundle: Path, out: Path, threads: int | None) -> WorkerRun:
     """A worker's process from its start to its end, as the pool runs it."""
     out.mkdir(parents=True)
-    order = {"bundle": str(bundle), "out": str(out), "method": "joint", "volume": asdict(Volume())}
+    order = {
+        "bundle": str(bundle),
+        "out": str(out),
+        "method": "joint",
+        "volume": Volume().model_dump(),
+    }
     environment = dict(os.environ)
     if threads is not None:
         environment |= dict.fromkeys(_THREAD_VARIABLES, str(threads))

@@ -13,10 +13,9 @@ from pathlib import Path
 import pytest
 from running_station import Station
 
-from station.core.config import CameraConfig
 from station.core.errors import DriverError
 from station.core.spool import Spool
-from station.sensors.freenect import LIBRARY_VARIABLE, FreenectDriver
+from station.sensors.freenect import LIBRARY_VARIABLE, FreenectCamera, FreenectDriver
 from station.sensors.registry import make_driver
 
 STATION = (sys.executable, "-m", "station.cli")
@@ -85,7 +84,7 @@ def test_a_camera_absent_from_the_calibration_is_named(
 
 def test_no_sensor_of_that_serial_is_said_with_a_remedy() -> None:
     """Through the real libfreenect: no Kinect is plugged into a test machine."""
-    driver = FreenectDriver("A00000000000000A")
+    driver = FreenectDriver(FreenectCamera(name="a", serial="A00000000000000A"))
     with pytest.raises(DriverError, match="Kinect A00000000000000A"):
         driver.open()
     driver.close()
@@ -93,7 +92,7 @@ def test_no_sensor_of_that_serial_is_said_with_a_remedy() -> None:
 
 def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch, booth: Path) -> None:
     monkeypatch.setenv(LIBRARY_VARIABLE, "/nowhere/libfreenect.so.0.5")
-    camera = CameraConfig(name="a", driver="freenect", recording=booth / "front-lower")
+    camera = FreenectCamera(name="a", recording=booth / "front-lower")
     with pytest.raises(DriverError, match=r"apt-get install libfreenect0\.5"):
         make_driver(camera).open()
 

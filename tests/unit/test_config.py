@@ -45,8 +45,11 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         (_CAMERA + _CAMERA, "the camera name front is used twice"),
         (_CAMERA + "[calibrate]\nball_radius_m = 0.06", "is lost from 2.4 m on"),
         (_CAMERA.replace("front", "../front", 1), "letters, digits"),
-        (_CAMERA.replace('"recorded"', '"kinect9"'), "'freenect', 'recorded' or 'virtual'"),
-        (_CAMERA.replace("recording =", "serial ="), "recorded needs the key recording"),
+        (
+            _CAMERA.replace('"recorded"', '"kinect9"'),
+            "no driver 'kinect9'; installed: freenect, recorded, virtual",
+        ),
+        (_CAMERA.replace("recording =", "serial ="), "cameras.0.recording: Field required"),
         ("version = 2\n" + _CAMERA, "version"),
     ],
 )

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from station.calibration.guide.feed import RecordedClock, gather_frames, replayed_feed
-from station.core.config import BoothConfig, CameraConfig
+from station.core.config import BoothConfig
 from station.core.errors import CalibrationError, FormatError
 from station.messaging.messages import FrameHeader
+from station.sensors.recorded import RecordedCamera
 from station.sensors.recording import RecordedFrame, write_recording
 
 _HZ = 60_000_000
@@ -64,9 +65,7 @@ def test_a_frame_of_another_recording_is_refused(tmp_path: Path) -> None:
 
 
 def _config(*names: str) -> BoothConfig:
-    cameras = tuple(
-        CameraConfig(name=name, driver="recorded", recording=Path("elsewhere")) for name in names
-    )
+    cameras = tuple(RecordedCamera(name=name, recording=Path("elsewhere")) for name in names)
     return BoothConfig(cameras=cameras)
 
 

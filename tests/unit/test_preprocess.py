@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from station.core.bundle import read_bundle
+from station.core.config import Volume
 from station.core.errors import InputError
 from station.core.kinect_v1 import RANDOM_SIGMA, STEP
 from station.core.lens import project, rays
@@ -19,7 +20,7 @@ from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
-from workers.cloud.preprocess import Volume, preprocess
+from workers.cloud.preprocess import preprocess
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
@@ -176,7 +177,7 @@ def test_a_large_step_is_never_missed(tmp_path: Path) -> None:
 
 def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:
     with pytest.raises(InputError, match="the booth is empty"):
-        preprocess(read_bundle(bundle), Volume((1.2, -0.5, 0.5), (1.8, 0.5, 2.0)))
+        preprocess(read_bundle(bundle), Volume(min_m=(1.2, -0.5, 0.5), max_m=(1.8, 0.5, 2.0)))
 
 
 def test_the_cloud_is_one_person_without_floor_and_walls(bundle: Path) -> None:

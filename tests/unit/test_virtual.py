@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import synthetic_calibration as synthetic
 
-from station.core.config import CameraConfig
 from station.core.errors import DriverError, FormatError, InputError
 from station.sensors.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
 from station.sensors.recording import check_recording, read_raw, write_recording
 from station.sensors.registry import make_driver
+from station.simulation.driver import SimulatedCamera
 from station.simulation.noise import UnitError, axial_sigma_m, raw_from_depth
 from station.simulation.scene import (
     VirtualScene,
@@ -120,7 +120,7 @@ def test_a_swaying_person_leans_from_frame_to_frame() -> None:
 
 
 def test_a_live_virtual_sensor_keeps_time() -> None:
-    camera = CameraConfig(name="front-upper", driver="virtual", body=BODIES / "ann.npz", seed=2)
+    camera = SimulatedCamera(name="front-upper", body=BODIES / "ann.npz", seed=2)
     driver = make_driver(camera)
     info = driver.open()
     frames = [driver.read(1.0) for _ in range(6)]
@@ -134,7 +134,7 @@ def test_a_live_virtual_sensor_keeps_time() -> None:
 
 
 def test_a_camera_that_the_virtual_booth_has_not_is_named() -> None:
-    camera = CameraConfig(name="ceiling", driver="virtual", body=BODIES / "ann.npz")
+    camera = SimulatedCamera(name="ceiling", body=BODIES / "ann.npz")
     with pytest.raises(DriverError, match="camera ceiling"):
         make_driver(camera).open()
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from station.core.bundle import Bundle
+from station.core.config import Volume
 from station.core.depth_image import Image, jumps
 from station.core.errors import InputError
 from station.core.lens import rays
@@ -44,15 +45,6 @@ _PLENTY_OF_FRAMES = 10
 """A scan that has so many lacks none, however long it took to get them."""
 _SIGMA_FLOOR_M = 4e-4
 """What averaging more frames does not take away: quantisation, calibration."""
-
-
-@dataclass(frozen=True, slots=True)
-class Volume:
-    """The part of the world in which the person is looked for, metres."""
-
-    min_m: tuple[float, float, float] = (-0.95, -0.75, 0.0)
-    max_m: tuple[float, float, float] = (0.95, 0.75, 2.2)
-    floor_clearance_m: float = 0.012
 
 
 def warm_up() -> None:

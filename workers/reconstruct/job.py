@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from station.core.bundle import read_bundle
+from station.core.config import Volume
 from workers.cloud.observed import PointCloud, Preprocessed
-from workers.cloud.preprocess import Volume, preprocess
+from workers.cloud.preprocess import preprocess
 from workers.cloud.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
 from workers.export.preview import preview

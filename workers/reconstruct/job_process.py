@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from station.core.config import Volume
 from station.core.errors import BoothError
 from station.core.service import die_with_parent
 
@@ -28,7 +29,6 @@ def main() -> None:
     # Libraries print to stdout; the pipe to the pool must hear this process alone.
     channel = os.dup(1)
     os.dup2(2, 1)
-    from workers.cloud.preprocess import Volume
     from workers.reconstruct.job import reconstruct_bundle, warm_up
 
     model = warm_up()
@@ -42,7 +42,7 @@ def main() -> None:
             Path(order["bundle"]),
             Path(order["out"]),
             method=order["method"],
-            volume=Volume(**order["volume"]),
+            volume=Volume.model_validate(order["volume"]),
             model=model,
             progress=lambda step, share: _say(channel, {"step": step, "share": share}),
         )

@@ -3,6 +3,7 @@ those of recordings replayed through the very same capture processes."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zmq
@@ -295,6 +297,7 @@ def replayed_feed(config: BoothConfig, recordings: Path) -> Iterator[Feed]:
 
     Raises:
         FormatError: a recording is missing or torn.
+        ConfigError: a camera's driver plays no recordings.
     """
     clocks = {camera.name: RecordedClock(recordings / camera.name) for camera in config.cameras}
     with tempfile.TemporaryDirectory(prefix="booth-replay-") as name:
@@ -302,10 +305,9 @@ def replayed_feed(config: BoothConfig, recordings: Path) -> Iterator[Feed]:
         path = folder / "booth.toml"
         lines = ["[runtime]", 'folder = "."', ""]
         for camera in config.cameras:
-            driver = "recorded" if camera.driver == "recorded" else "freenect"
-            recording = str((recordings / camera.name).resolve())
-            lines += ["[[cameras]]", f'name = "{camera.name}"', f'driver = "{driver}"']
-            lines += [f"serial = {_toml(camera.serial)}", f"recording = {_toml(recording)}", ""]
+            recorded = camera.replaying((recordings / camera.name).resolve())
+            keys = recorded.model_dump(mode="json", exclude_none=True)
+            lines += ["[[cameras]]", *(f"{key} = {_toml(value)}" for key, value in keys.items())]
         path.write_text("\n".join(lines))
         command = [sys.executable, "-m", "station.cli", "capture"]
         log = (folder / "capture.log").open("w")
@@ -335,7 +337,6 @@ def replayed_feed(config: BoothConfig, recordings: Path) -> Iterator[Feed]:
             log.close()
 
 
-def _toml(text: str) -> str:
-    """A TOML basic string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+def _toml(value: Any) -> str:
+    """A value as TOML: JSON's strings, numbers, truth values and lists are TOML's too."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

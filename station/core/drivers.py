@@ -1,0 +1,96 @@
+"""The cameras' sections of booth.toml, and how the driver that each one names is found.
+
+A driver is a class that reads one kind of sensor (`station.sensors.base.DepthDriver`). Its package
+declares it in the entry point group `body_booth.drivers`; the entry point's name is what stands
+under `driver` in booth.toml. Its attribute `Config` is the class of its section there, a subclass
+of `CameraConfig`. No other place lists the drivers.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
+
+from station.core.errors import ConfigError
+
+ENTRY_POINTS = "body_booth.drivers"
+BASE_FOLDER = "base_folder"
+"""Key of the validation context: the folder that relative paths are relative to."""
+
+
+def _plain_name(name: str) -> str:
+    if not name or not all(c.isalnum() or c in "-_" for c in name) or not name.isascii():
+        raise ValueError("use letters, digits, '-' and '_' only")
+    return name
+
+
+def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
+    base = (info.context or {}).get(BASE_FOLDER)
+    return path if base is None else base / path
+
+
+Name = Annotated[str, AfterValidator(_plain_name)]
+ConfigPath = Annotated[Path, AfterValidator(_beside_the_file)]
+"""A path in the configuration: a relative one is relative to the configuration file."""
+
+
+class Strict(BaseModel):
+    """A section of the configuration: unknown keys and impossible values are errors."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True
+    )
+
+
+class CameraConfig(Strict):
+    """What every camera's section holds; each driver adds keys of its own."""
+
+    name: Name = Field(description="the camera's name in the calibration and in every message")
+    driver: str = Field(description="how it is read: the name of an installed driver")
+
+    def replaying(self, recording: Path) -> CameraConfig:
+        """The section of this camera as it plays a recording instead.
+
+        Raises:
+            ConfigError: its driver plays no recordings.
+        """
+        del recording
+        raise ConfigError(
+            f"camera {self.name}: the driver {self.driver} plays no recordings; "
+            "use a configuration whose cameras are read by one that does"
+        )
+
+
+def driver_class(name: str) -> Any:
+    """The class of a driver by name; only the module in use is imported.
+
+    Raises:
+        ConfigError: no such driver is installed, or its package cannot be imported.
+    """
+    found = list(entry_points(group=ENTRY_POINTS, name=name))
+    if not found:
+        known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)}))
+        raise ConfigError(
+            f"there is no driver {name!r}; installed: {known or 'none, install body-booth again'}"
+        )
+    try:
+        return found[0].load()
+    except (ImportError, AttributeError) as cause:
+        raise ConfigError(
+            f"the driver {name} ({found[0].value}) cannot be loaded ({cause}); "
+            "install its package again"
+        ) from None
+
+
+class AnyCamera(CameraConfig):
+    """A section of which only the common keys are looked at."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    def of_its_driver(self) -> type[CameraConfig]:
+        """The class that the whole section is checked by."""
+        found: type[CameraConfig] = driver_class(self.driver).Config
+        return found
