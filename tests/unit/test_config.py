@@ -24,7 +24,7 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
     path = tmp_path / "booth.toml"
     path.write_text(_CAMERA)
     config = load_config(path)
-    assert config.camera("front").recording == tmp_path / "recordings/front"
+    assert config.camera("front").model_dump()["recording"] == tmp_path / "recordings/front"
     assert config.spool.folder == tmp_path / "spool"
     assert config.calibration == tmp_path / "calibration.json"
     assert config.runtime.folder == tmp_path / "run"
