@@ -60,7 +60,7 @@ from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import reconstruct_bundle, warm_up
 from workers.scape.fit.fit import fit_body, sampling_of
 from workers.scape.fit.initial import starting_states
-from workers.scape.fit.verdict import words_of
+from workers.scape.fit.verdict import part_in_words
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
@@ -242,7 +242,7 @@ def draw_worst(rows: dict[str, list[Row]], model: BodyModel, folder: Path) -> No
         part, rms = row.errors.worst_part
         assert row.case.body is not None
         title = (
-            f"{group} {row.case.name}: {words_of(part)} {rms:.1f} mm rms; red: 10 mm off; "
+            f"{group} {row.case.name}: {part_in_words(part)} {rms:.1f} mm rms; red: 10 mm off; "
             "below: the result"
         )
         path = folder / f"worst-{group}.png"

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -26,10 +25,9 @@ from station.core.bundle import read_bundle
 from station.simulation.scene import Mesh, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
-from workers.measure import intervals
 from workers.measure.body import Content, MeasuredBody, measure_body, measure_standing
 from workers.measure.definitions import DEFINITIONS
-from workers.measure.intervals import Pose, learned, line_sigma, sides_pooled, to_document
+from workers.measure.intervals import Pose, line_sigma, sides_pooled, write_shipped
 from workers.measure.standing import standard_turns, stood_upright
 from workers.measure.tracing import trace_all
 from workers.reconstruct.job import warm_up
@@ -143,7 +141,7 @@ def accepted(scans: Iterator[Scan], wanted: int) -> list[Scan]:
     return kept
 
 
-def calibrate(model: BodyModel, scans: Sequence[Scan], out: Path) -> None:
+def calibrate(model: BodyModel, scans: Sequence[Scan]) -> None:
     """Learn the intervals' error models and write them as the package's data."""
     found: dict[Pose, dict[str, tuple[list[float], list[float]]]] = {pose: {} for pose in POSES}
     for scan in scans:
@@ -162,14 +160,9 @@ def calibrate(model: BodyModel, scans: Sequence[Scan], out: Path) -> None:
                 errors, sigmas = found[pose].setdefault(name, ([], []))
                 errors.append(content.value / truth[name] - 1.0)
                 sigmas.append(0.0)
-    models = {
-        pose: {name: learned(np.array(e), np.array(s)) for name, (e, s) in rows.items()}
-        for pose, rows in found.items()
-    }
     made_of = {"split": "validation", "bodies": len(scans), "model_sha256": model.sha256}
-    out.parent.mkdir(exist_ok=True)
-    out.write_text(json.dumps(to_document(models, made_of), indent=1) + "\n", encoding="utf-8")
-    print(f"{out}: error models of {len(models['standard'])} rows from {len(scans)} bodies")
+    path = write_shipped(found, made_of)
+    print(f"{path}: error models of {len(found['standard'])} rows from {len(scans)} bodies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +323,7 @@ def main() -> None:
         if arguments.calibrate:
             count = arguments.calibrate
             scans = accepted(studio.population("validation", count), count)
-            calibrate(model, scans, Path(intervals.__file__).parent / intervals.SHIPPED)
+            calibrate(model, scans)
             return
         # A quarter more than wanted: some are told to be scanned again.
         scans = accepted(studio.population("test", arguments.bodies * 5 // 4), arguments.bodies)

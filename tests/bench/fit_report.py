@@ -10,7 +10,7 @@ from fit_cases import Case
 from surface_errors import SurfaceErrors
 
 from workers.scape.fit.fit import FitResult
-from workers.scape.fit.verdict import words_of
+from workers.scape.fit.verdict import part_in_words
 
 _LOST_MM = 15.0
 _PAPERS_SECONDS = 60.0
@@ -36,7 +36,7 @@ class Row:
             name
             for name in lost
             if verdict.status != "rescan"
-            or not any(words_of(name) in reason for reason in verdict.reasons)
+            or not any(part_in_words(name) in reason for reason in verdict.reasons)
         ]
 
 
@@ -88,7 +88,7 @@ def print_row(row: Row) -> None:
     print(
         f"{row.case.group:<7}{row.case.name:<22}{errors.body_rms:7.2f}{errors.extremity_rms:7.2f}"
         f"{errors.seen_median:7.2f}{errors.height:8.1f}{row.fit_s:7.2f}{row.whole_s:7.2f}"
-        f"  {verdict.status:<7}{words_of(part)} {rms:.1f}",
+        f"  {verdict.status:<7}{part_in_words(part)} {rms:.1f}",
         flush=True,
     )
     for reason in verdict.reasons:
@@ -124,7 +124,7 @@ def print_worst_parts(rows: dict[str, list[Row]]) -> None:
         for name in order[:4]:
             worst = int(np.argmax(table[name]))
             print(
-                f"{group:<8}{words_of(name):<20}{np.sqrt(np.mean(np.square(table[name]))):7.2f}"
+                f"{group:<8}{part_in_words(name):<20}{np.sqrt(np.mean(np.square(table[name]))):7.2f}"
                 f"{table[name][worst]:8.2f}  {found[worst].case.name}"
             )
 

@@ -19,8 +19,9 @@ from station.simulation.scene import (
 )
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.crown import Reach, reach
+from workers.scape.evidence.crown import crown_rows
 from workers.scape.evidence.rims import rims_of
+from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.displacement import fit_surface
@@ -66,8 +67,8 @@ def _view(
     )
 
 
-def _reach(model: BodyModel, view: CameraView, body: np.ndarray) -> Reach:
-    return reach(model, [view], [view.calibration.world_from_camera], body)
+def _reach(model: BodyModel, view: CameraView, body: np.ndarray) -> Rows:
+    return crown_rows(model, [view], [view.calibration.world_from_camera], body)
 
 
 @pytest.mark.parametrize("pose", [POSE, TURNED], ids=["upright", "upside down"])
@@ -78,9 +79,9 @@ def test_a_head_ends_where_the_booth_begins(
     for shift in (-HIGHER, 0.0 * HIGHER, HIGHER):
         found = _reach(model, view, body - shift)
         # Of the pixel, 3 mm wide, half is known.
-        assert np.mean(found.distance_m) == pytest.approx(shift[2], abs=0.0015)
+        assert np.mean(found.residual_m) == pytest.approx(shift[2], abs=0.0015)
         assert (found.direction[:, 2] > 0.95).all()
-        assert (body[found.vertex, 2] > body[:, 2].max() - 0.02).all()
+        assert (body[found.place, 2] > body[:, 2].max() - 0.02).all()
 
 
 def test_a_camera_says_it_once_however_many_columns_it_has(
@@ -88,52 +89,52 @@ def test_a_camera_says_it_once_however_many_columns_it_has(
 ) -> None:
     view = _view(model, body)
     once = _reach(model, view, body)
-    twice = reach(model, [view, view], [POSE, POSE], body)
-    assert len(once.vertex) > 6
-    assert once.information.sum() == pytest.approx(1.0 / 0.0015**2)
-    assert twice.information.sum() == pytest.approx(2.0 * once.information.sum())
+    twice = crown_rows(model, [view, view], [POSE, POSE], body)
+    assert len(once.place) > 6
+    assert once.weight.sum() == pytest.approx(1.0 / 0.0015**2)
+    assert twice.weight.sum() == pytest.approx(2.0 * once.weight.sum())
 
 
 def test_where_no_booth_is_seen_a_head_is_no_lower_than_its_last_reading(
     model: BodyModel, body: np.ndarray
 ) -> None:
     view = _view(model, body, walls=False)
-    assert 0.001 < np.mean(_reach(model, view, body - HIGHER).distance_m) < 0.0075
-    assert not len(_reach(model, view, body + HIGHER).vertex)
-    assert not len(_reach(model, _view(model, body, walls=False, bald=False), body).vertex)
+    assert 0.001 < np.mean(_reach(model, view, body - HIGHER).residual_m) < 0.0075
+    assert not len(_reach(model, view, body + HIGHER).place)
+    assert not len(_reach(model, _view(model, body, walls=False, bald=False), body).place)
 
 
 def test_hair_that_gives_no_reading_is_no_crown(model: BodyModel, body: np.ndarray) -> None:
-    assert not len(_reach(model, _view(model, body, bald=False), body).vertex)
+    assert not len(_reach(model, _view(model, body, bald=False), body).place)
 
 
 def test_a_camera_on_its_side_has_the_projectors_shadow_over_the_head(
     model: BodyModel, body: np.ndarray
 ) -> None:
-    assert not len(_reach(model, _view(model, body, ROLLED), body).vertex)
+    assert not len(_reach(model, _view(model, body, ROLLED), body).place)
 
 
 def test_a_stick_above_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:
     x, y, z = body[np.argmax(body[:, 2])]
     stick = rod((x - 0.3, y, z + 0.03), (x + 0.3, y, z + 0.03), 0.004)
     found = _reach(model, _view(model, body, beside=[stick]), body)
-    assert np.mean(found.distance_m) == pytest.approx(0.0, abs=0.0015)
+    assert np.mean(found.residual_m) == pytest.approx(0.0, abs=0.0015)
 
 
 def test_a_bun_on_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:
     x, y, z = body[np.argmax(body[:, 2])]
     for radius in (0.025, 0.04):
         bun = sphere((x, y + 0.02, z + 0.2 * radius), radius)
-        assert not len(_reach(model, _view(model, body, beside=[bun]), body).vertex)
+        assert not len(_reach(model, _view(model, body, beside=[bun]), body).place)
 
 
 def test_a_head_beyond_the_image_is_no_crown(model: BodyModel, body: np.ndarray) -> None:
     taller = body * (2.3 / body[:, 2].max())
-    assert not len(_reach(model, _view(model, taller), taller).vertex)
+    assert not len(_reach(model, _view(model, taller), taller).place)
 
 
 def test_a_bare_cloud_has_no_outline(model: BodyModel, body: np.ndarray) -> None:
-    assert not len(reach(model, [], [], body).vertex)
+    assert not len(crown_rows(model, [], [], body).place)
 
 
 def test_a_corrected_camera_stands_where_its_points_are_moved_to(
@@ -144,11 +145,11 @@ def test_a_corrected_camera_stands_where_its_points_are_moved_to(
     points = transform(POSE, local)
     camera = np.zeros(len(points), np.int16)
     cloud = PointCloud(points, points, np.ones(len(points)), camera, ("front-upper",))
-    corrections = CameraCorrections.build(cloud, [view]).stepped(
+    corrections = CameraCorrections.build(cloud, [view]).updated(
         np.array([[0.003, -0.002, 0.001, 0.004, 0.001, -0.002]])
     )
     pose = corrections.poses([view])[0]
-    assert np.allclose(transform(pose, local), corrections.moved(points, camera), atol=1e-9)
+    assert np.allclose(transform(pose, local), corrections.apply(points, camera), atol=1e-9)
 
 
 def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
@@ -172,7 +173,7 @@ def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
 
     def missing(views: list[CameraView]) -> float:
         poses = [view.calibration.world_from_camera for view in views]
-        crown = partial(reach, model, views, poses)
+        crown = partial(crown_rows, model, views, poses)
         fitted = fit_surface(model, body, cloud, rims_of((), cloud.camera_names, ()), crown)
         return float(higher[:, 2].max() - fitted.vertices[:, 2].max())
 

@@ -1,4 +1,4 @@
-"""Compiled loops do what a line of numpy says, and followers find what a search finds."""
+"""Compiled loops do what a line of numpy says, and tracking finds what a search finds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from station.simulation.scene import sphere
-from workers.scape.evidence.correspondence import Followers, OrientedTree
+from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
 from workers.scape.fit.initial import posed, starting_states
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import (
@@ -20,7 +20,7 @@ from workers.scape.model.deformation import (
     neighbours,
     vertex_normals,
 )
-from workers.scape.model.kernels import conjugate_gradients, follow, trimmed_costs
+from workers.scape.model.kernels import conjugate_gradients, descend, trimmed_costs
 from workers.scape.model.sampled import SampledBody
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
@@ -93,7 +93,7 @@ def test_downhill_ends_where_no_neighbour_is_nearer() -> None:
     nodes = np.concatenate([BALL.vertices, 0.1 * normals], axis=1)
     points = nodes.mean(axis=0) + 0.4 * rng.standard_normal((300, 6))
     start = rng.integers(0, len(nodes), 300)
-    found, _ = follow(points, nodes, *graph, start, np.inf, -np.inf)
+    found, _ = descend(points, nodes, *graph, start, np.inf, -np.inf)
 
     def away(index: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points - nodes[index], axis=1)
@@ -105,7 +105,7 @@ def test_downhill_ends_where_no_neighbour_is_nearer() -> None:
         assert (np.linalg.norm(around - point, axis=1) >= least - 1e-12).all()
     # A ball has no hollow in which to stop short.
     outside = nodes[start] + np.concatenate([0.01 * normals[start], np.zeros((300, 3))], axis=1)
-    found, _ = follow(outside, nodes, *graph, rng.permutation(start), np.inf, -np.inf)
+    found, _ = descend(outside, nodes, *graph, rng.permutation(start), np.inf, -np.inf)
     assert np.array_equal(found, start)
 
 
@@ -116,7 +116,7 @@ def test_followers_are_held_to_the_limits_and_may_have_no_start() -> None:
     points = nodes[[5, 5, 5, 5]]
     points[1, :3] += 0.011 * normals[5]
     points[2, 3:] *= -0.01
-    found, kept = follow(points, nodes, *neighbours(BALL.faces), start, 0.01**2, 0.9)
+    found, kept = descend(points, nodes, *neighbours(BALL.faces), start, 0.01**2, 0.9)
     assert found[0] == 5
     assert found[3] == -1
     assert kept.tolist() == [True, False, False, False]
@@ -137,15 +137,15 @@ def _skin_points(
 
 
 @pytest.mark.parametrize("dense", [False, True])
-def test_followers_find_what_a_search_finds(model: BodyModel, dense: bool) -> None:
+def test_tracking_finds_what_a_search_finds(model: BodyModel, dense: bool) -> None:
     """At once, and after the surface has moved a little; far points find nothing."""
     normals = vertex_normals(model.mean, model.faces)
     points, directions = _skin_points(model, model.mean, 6000)
     points[:10] += 0.5
-    followers = Followers(model.neighbours, points, directions, dense=dense)
+    tracked = TrackedPoints(model.neighbours, points, directions, dense=dense)
     for shift_m in (0.0, 0.003):
         moved = model.mean + np.array([shift_m, -shift_m, 0.0])
-        used, vertex = followers.pairs(moved, normals, **LIMITS)
+        used, vertex = tracked.pairs(moved, normals, **LIMITS)
         asked, nearest = OrientedTree.build(moved, normals).pairs(points, directions, **LIMITS)
         assert used.min() >= 10
         assert abs(len(used) - len(asked)) < 0.005 * len(asked)
@@ -155,12 +155,12 @@ def test_followers_find_what_a_search_finds(model: BodyModel, dense: bool) -> No
         assert same.all() if shift_m == 0.0 and not dense else same.mean() > 0.97
 
 
-def test_a_scout_led_astray_does_not_mislead(model: BodyModel) -> None:
-    """One point of four has a vertex to set out from; what it cannot reach is searched for."""
+def test_points_misled_by_the_coarse_search_are_matched(model: BodyModel) -> None:
+    """One point of four is searched for; what cannot be reached from it is matched individually."""
     normals = vertex_normals(model.mean, model.faces)
     points, directions = _skin_points(model, model.mean, 400)
     points[::4] += 0.5
-    used, _ = Followers(model.neighbours, points, directions, dense=True).pairs(
+    used, _ = TrackedPoints(model.neighbours, points, directions, dense=True).pairs(
         model.mean, normals, **LIMITS
     )
     asked, _ = OrientedTree.build(model.mean, normals).pairs(points, directions, **LIMITS)
@@ -168,11 +168,11 @@ def test_a_scout_led_astray_does_not_mislead(model: BodyModel) -> None:
 
 
 @pytest.mark.parametrize("dense", [False, True])
-def test_no_points_follow_nothing(dense: bool) -> None:
+def test_no_points_have_no_pairs(dense: bool) -> None:
     normals = vertex_normals(BALL.vertices, BALL.faces)
-    followers = Followers(neighbours(BALL.faces), np.empty((0, 3)), np.empty((0, 3)), dense=dense)
+    tracked = TrackedPoints(neighbours(BALL.faces), np.empty((0, 3)), np.empty((0, 3)), dense=dense)
     for _ in range(2):
-        used, vertex = followers.pairs(BALL.vertices, normals, **LIMITS)
+        used, vertex = tracked.pairs(BALL.vertices, normals, **LIMITS)
         assert len(used) == len(vertex) == 0
 
 

@@ -1,16 +1,16 @@
-"""How far a value may be off: 95 % intervals from a calibrated model of the error.
+"""95 % intervals of measurements, from a calibrated model of their errors.
 
-A row errs because the surface is off, which the fit's posterior knows for each vertex, and because
-landmarks slide along the skin from fit to fit, which it does not know. So
+The error of a row has two causes: the error of the surface, whose standard deviation the fit gives
+for each vertex, and landmarks that slide along the skin from fit to fit, which it does not know. So
 
     half width = sqrt(constant^2 + (gain sigma)^2),
 
-sigma being the posterior standard deviation, rms along the row's line. `constant`, `gain` and the
-row's systematic error `bias` are learned from scans of held-out bodies of which the truth is known
-(conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), so that an interval holds the
-truth 95 times of 100. As scanned the bias shifts the interval alone: a value is the length of its
-line. In the standard pose, which no camera saw, the bias is what carrying a body there adds on the
-average, and it is taken off the value.
+where sigma is the posterior standard deviation, rms along the row's line. `constant`, `gain` and
+the row's systematic error `bias` are learned from scans of held-out bodies with known dimensions
+(conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), so that an interval contains the
+truth in 95 of 100 cases. As scanned, the bias shifts only the interval, since a value is the length
+of its line. In the standard pose, which no camera saw, the bias is the mean error of re-posing the
+body, and it is subtracted from the value.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -36,23 +37,25 @@ VERSION = 1
 SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
 _RATIOS = (0.0, 0.3, 0.6, 1.0, 1.7, 3.0)
-"""Candidates of gain x median sigma : constant."""
+"""Candidates for the ratio of gain times median sigma to constant."""
 _OUTLIER = 6.0
-"""Median absolute deviations beyond which an error says nothing about the ordinary spread."""
+"""Median absolute deviations beyond which an error does not count to the spread."""
+_NORMAL_MAD = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """Of one row in one pose; metres, or shares of the value for volume and surface."""
+    """Error of one row in one pose, in metres; for volume and surface as a share of the value."""
 
     bias: float
     constant: float
     gain: float
 
     def interval(self, value: float, sigma: float) -> tuple[float, float]:
-        """The 95 % interval of a value whose line has this posterior deviation.
+        """95 % interval of a value whose line has the standard deviation `sigma`.
 
-        It always holds the value itself, and no length below 0.
+        It always contains the value and no negative length.
         """
         half = float(np.hypot(self.constant, self.gain * sigma))
         middle = value - self.bias
@@ -60,22 +63,22 @@ class ErrorModel:
 
 
 def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
-    """Posterior deviation (m) of the surface, rms along a row's line."""
+    """Posterior standard deviation (m) of the surface, rms along a row's line."""
     tail, head = vertex_sigma_m[trace.points.tail], vertex_sigma_m[trace.points.head]
     along = tail + trace.points.share * (head - tail)
     return float(np.sqrt(np.mean(along**2)))
 
 
 def learned(errors: Array, sigmas: Array) -> ErrorModel:
-    """The error model of a row from the errors (n,) of held-out scans and their line sigmas (n,).
+    """Error model of a row from the errors (n,) of held-out scans and their line sigmas (n,).
 
     The bias is shrunk by its own uncertainty (James & Stein 1961, positive part), so that noise of
-    the calibration does not pass for a systematic error. The ratio of gain to constant is the
-    likeliest one; their size is the conformal quantile.
+    the calibration is not taken for a systematic error. The ratio of gain to constant is the one of
+    highest likelihood; their size is the conformal quantile.
     """
     middle = float(np.median(errors))
-    spread = 1.4826 * float(np.median(np.abs(errors - middle)))
-    kept = np.abs(errors - middle) <= _OUTLIER * spread / 1.4826
+    spread = _NORMAL_MAD * float(np.median(np.abs(errors - middle)))
+    kept = np.abs(errors - middle) <= _OUTLIER * spread / _NORMAL_MAD
     mean = float(errors[kept].mean())
     doubt = float(errors[kept].var(ddof=1)) / int(kept.sum())
     bias = mean * max(0.0, 1.0 - doubt / max(mean**2, 1e-30))
@@ -96,7 +99,7 @@ def learned(errors: Array, sigmas: Array) -> ErrorModel:
 
 @lru_cache(maxsize=1)
 def shipped() -> Mapping[Pose, Mapping[str, ErrorModel]]:
-    """The calibration that comes with the package: pose -> row -> error model.
+    """Error models that come with the package, by pose and row.
 
     Raises:
         FormatError: the file is damaged or of another version.
@@ -106,7 +109,7 @@ def shipped() -> Mapping[Pose, Mapping[str, ErrorModel]]:
 
 
 def from_document(document: Mapping[str, Any]) -> Mapping[Pose, Mapping[str, ErrorModel]]:
-    """Read intervals.json."""
+    """Error models of an intervals.json document."""
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise FormatError(
             f"{SHIPPED} is {document.get('format')!r} version {document.get('version')!r}; "
@@ -121,7 +124,7 @@ def from_document(document: Mapping[str, Any]) -> Mapping[Pose, Mapping[str, Err
 def to_document(
     models: Mapping[Pose, Mapping[str, ErrorModel]], made_of: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """intervals.json."""
+    """Document of intervals.json; `made_of` names the scans and the model it was learned from."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -140,13 +143,33 @@ def to_document(
     }
 
 
+def write_shipped(
+    errors: Mapping[Pose, Mapping[str, tuple[Sequence[float], Sequence[float]]]],
+    made_of: Mapping[str, Any],
+) -> Path:
+    """Learn the error models of all rows and write them as the package's data.
+
+    Args:
+        errors: by pose and row (`sides_pooled`), the errors of scans and their line sigmas.
+        made_of: split, number of bodies and the model's SHA-256.
+    """
+    models = {
+        pose: {name: learned(np.array(e), np.array(s)) for name, (e, s) in rows.items()}
+        for pose, rows in errors.items()
+    }
+    path = Path(str(resources.files("workers.measure").joinpath(SHIPPED)))
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(to_document(models, made_of), indent=1) + "\n", encoding="utf-8")
+    return path
+
+
 def sides_pooled(name: str) -> str:
-    """Left and right err alike: rows that differ only in the side share one error model."""
+    """Name of a row without its side: left and right share one error model."""
     return name.removesuffix("_left").removesuffix("_right")
 
 
 def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
-    """The value (m) of each row, never below 0."""
+    """Value (m) of each row, never negative."""
     if pose == "as-scanned":
         return [trace.value_m for trace in traces]
     return [max(0.0, trace.value_m - _model_of(trace, pose).bias) for trace in traces]
@@ -155,8 +178,12 @@ def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
 def intervals(
     traces: Sequence[Trace], values: Sequence[float], vertex_sigma_m: Array | None, pose: Pose
 ) -> list[tuple[float, float]]:
-    """The 95 % interval of each row, about the value that `row_values` gives it; without a
-    posterior the mesh itself is the truth."""
+    """95 % interval of each row.
+
+    Args:
+        values: as `row_values` gives them.
+        vertex_sigma_m: (P,), the fit's standard deviations; None for a mesh that counts as exact.
+    """
     if vertex_sigma_m is None:
         return [(value, value) for value in values]
     found = []
@@ -175,7 +202,7 @@ def _model_of(trace: Trace, pose: Pose) -> ErrorModel:
 def content_interval(
     name: str, value: float, vertex_sigma_m: Array | None, pose: Pose
 ) -> tuple[float, float]:
-    """The 95 % interval of a volume or a surface, whose error is a share of it."""
+    """95 % interval of a volume or a surface, whose error is a share of the value."""
     if vertex_sigma_m is None:
         return value, value
     low, high = shipped()[pose][name].interval(1.0, 0.0)

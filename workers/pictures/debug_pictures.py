@@ -23,7 +23,7 @@ from workers.pictures.render import (
     png,
     write_text,
 )
-from workers.scape.fit.observer import Stage
+from workers.scape.fit.observer import Event
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ _OUTSIDE, _INSIDE = np.array([60.0, 60.0, 235.0]), np.array([235.0, 120.0, 50.0]
 _MET, _UNSEEN = np.array([225.0, 235.0, 225.0]), np.array([150.0, 150.0, 150.0])
 _CLOSE_M = 0.01
 _BARE_DARK, _BARE_LIGHT = 60.0, 200.0
-_BODY_STAGES = {
+_BODY_EVENTS = {
     "start": (2, "start"),
     "joint": (4, "model fitted (pose and shape)"),
     "done": (6, "result"),
@@ -63,19 +63,19 @@ class DebugPictures:
         self._points: Array = np.empty((0, 3))
         self._normals: Array = np.empty((0, 3))
 
-    def __call__(self, stage: Stage, arrays: Mapping[str, NDArray[Any]]) -> None:
-        if stage == "cloud":
+    def __call__(self, event: Event, arrays: Mapping[str, NDArray[Any]]) -> None:
+        if event == "cloud":
             self._points, self._normals = arrays["points"].copy(), arrays["normals"].copy()
             self._write("1-cloud", f"cloud: {len(self._points):,} points", self._bare)
             return
         scene = Scene(arrays["vertices"], self._faces)
-        if stage == "correspondences":
+        if event == "correspondences":
             self._draw_pairs(scene, arrays["on_body"], arrays["on_cloud"])
-        elif stage == "surface":
+        elif event == "surface":
             self._draw_errors(scene, arrays["residual_m"])
         else:
-            number, title = _BODY_STAGES[stage]
-            self._write(f"{number}-{stage}", title, lambda frame: self._over(scene, frame))
+            number, title = _BODY_EVENTS[event]
+            self._write(f"{number}-{event}", title, lambda frame: self._over(scene, frame))
 
     def _draw_pairs(self, scene: Scene, on_body: Array, on_cloud: Array) -> None:
         self._rounds += 1

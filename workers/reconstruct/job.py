@@ -25,12 +25,12 @@ from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
-    LaidBody,
     Method,
+    OverlappingFit,
     fit_body,
-    lay_body,
-    one_thread_in_blas,
-    take_apart,
+    fit_overlapping,
+    separate_limbs,
+    single_threaded_blas,
 )
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.model.body_model import BodyModel, load_model
@@ -133,13 +133,13 @@ def _fitted(
     observer: Observer,
 ) -> JobSummary:
     """Fit, measure, write."""
-    with one_thread_in_blas():
-        laid = lay_body(model, scan, method, progress, observer)
+    with single_threaded_blas():
+        laid = fit_overlapping(model, scan, method, progress, observer)
         progress("measuring", 0.0)
         # Neither needs what the other finds.
         with ThreadPoolExecutor(1) as beside:
             measuring = beside.submit(_measured, model, laid, watch)
-            fit = take_apart(model, laid, scan.findings, observer)
+            fit = separate_limbs(model, laid, scan.findings, observer)
             measured, standing = measuring.result()
         watch.seconds.update(fit.seconds)
         progress("writing", 0.0)
@@ -149,7 +149,7 @@ def _fitted(
 
 
 def _measured(
-    model: BodyModel, laid: LaidBody, watch: Stopwatch
+    model: BodyModel, laid: OverlappingFit, watch: Stopwatch
 ) -> tuple[MeasuredBody, MeasuredBody]:
     """As scanned, and in the standard standing pose."""
     with watch.step("measure"):

@@ -1,7 +1,8 @@
-"""Small rigid corrections of the cameras, estimated with the body and bound to the calibration.
+"""Small rigid corrections of the cameras, estimated together with the body.
 
-Each camera may stand a little off where the calibration has it: its points then move together,
-p' = p + omega x (p - eye) + tau, world axes, to first order.
+A camera may be slightly off its calibrated pose. All its points then move together,
+p' = p + omega x (p - eye) + tau in world axes, to first order. A prior centred on the calibration
+keeps the corrections small.
 """
 
 from __future__ import annotations
@@ -14,32 +15,33 @@ from numpy.typing import NDArray
 
 from station.core.geometry import rigid, so3_exp
 from workers.cloud.observed import CameraView, PointCloud
-from workers.scape.model.kernels import moved
+from workers.scape.model.kernels import transform_groups
 
 Array = NDArray[np.float64]
 Index = NDArray[np.integer]
 
 _TURN_SIGMA_RAD = np.radians(0.015)
 _SHIFT_SIGMA_M = 0.0003
+"""Standard deviations of the prior; the calibration's own covariance is added."""
 _FREEDOM = 0.5
-"""The calibration is believed by so much at first; its own covariance comes on top. Heavy tails
-(_FREEDOM, of Student's t) let one camera go that was knocked."""
+"""Degrees of freedom of the prior, a Student t distribution: its heavy tails release a single
+camera that was knocked."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraCorrections:
-    """C cameras, in the order of the cloud's names."""
+    """Corrections of C cameras, in the order of the cloud's names."""
 
     eyes: Array
-    """(C, 3): where the cameras stand."""
+    """(C, 3): calibrated positions of the cameras."""
     information: Array
-    """(C, 6, 6): of the prior over xi, whose mean is 0."""
+    """(C, 6, 6): inverse covariance of the prior over xi, whose mean is 0."""
     xi: Array
     """(C, 6): omega in radians, tau in metres."""
 
     @classmethod
     def build(cls, cloud: PointCloud, views: Sequence[CameraView]) -> CameraCorrections:
-        """No correction yet; a bare cloud, which has no cameras, has none to correct."""
+        """Zero corrections; none for a bare cloud, which has no cameras."""
         by_name = {view.name: view.calibration for view in views}
         if not by_name:
             return cls(np.empty((0, 3)), np.empty((0, 6, 6)), np.empty((0, 6)))
@@ -60,23 +62,23 @@ class CameraCorrections:
         return len(self.xi)
 
     def corrected(self, cloud: PointCloud) -> PointCloud:
-        """The cloud where the corrections have it."""
+        """Cloud with the corrections applied to its points and normals."""
         if not len(self):
             return cloud
         turns = so3_exp(self.xi[:, :3])
-        normals = moved(cloud.normals, cloud.camera, turns, np.zeros_like(self.eyes))
-        return replace(cloud, points=self.moved(cloud.points, cloud.camera), normals=normals)
+        normals = transform_groups(cloud.normals, cloud.camera, turns, np.zeros_like(self.eyes))
+        return replace(cloud, points=self.apply(cloud.points, cloud.camera), normals=normals)
 
-    def moved(self, points: Array, camera: Index) -> Array:
-        """Points (n, 3) of cameras (n,) where the corrections have them."""
+    def apply(self, points: Array, camera: Index) -> Array:
+        """Points (n, 3) of cameras (n,) with the corrections applied."""
         if not self.xi.any():
             return points
         turns = so3_exp(self.xi[:, :3])
         shifts = self.eyes + self.xi[:, 3:] - np.einsum("cij,cj->ci", turns, self.eyes)
-        return np.asarray(moved(points, camera, turns, shifts))
+        return np.asarray(transform_groups(points, camera, turns, shifts))
 
     def poses(self, views: Sequence[CameraView]) -> list[Array]:
-        """world_from_camera (4, 4) of the cloud's views where the corrections have them."""
+        """Corrected world_from_camera (4, 4) of the cloud's views."""
         found = []
         for view, eye, xi in zip(views, self.eyes, self.xi, strict=True):
             turn = so3_exp(xi[None, :3])[0]
@@ -85,27 +87,29 @@ class CameraCorrections:
         return found
 
     def shifts_m(self, cloud: PointCloud) -> dict[str, float]:
-        """How far the corrections move each camera's points, in the middle of them."""
+        """Distance by which the corrections move the centroid of each camera's points."""
         found = {}
         for index, name in enumerate(cloud.camera_names[: len(self)]):
             mine = cloud.points[cloud.camera == index]
             if len(mine):
                 middle = mine.mean(axis=0)[None]
-                moved = self.moved(middle, np.full(1, index, cloud.camera.dtype))
-                found[name] = float(np.linalg.norm(moved - middle))
+                corrected = self.apply(middle, np.full(1, index, cloud.camera.dtype))
+                found[name] = float(np.linalg.norm(corrected - middle))
         return found
 
     def derivative(self, points: Array, camera: Index, directions: Array) -> Array:
-        """(n, 6): how far each point goes along its direction for a unit of its camera's xi."""
+        """Derivatives (n, 6) of the points' positions along directions by their cameras' xi."""
         lever = np.cross(points - self.eyes[camera], directions)
         return np.concatenate([lever, directions], axis=1)
 
-    def bound(self) -> Array:
-        """(C, 6, 6): the prior's information, less for a camera that has left it (Student's t):
-        one camera that was knocked is likelier than four that drifted."""
+    def prior_information(self) -> Array:
+        """Information (C, 6, 6) of the prior, reweighted by Student's t at the present corrections.
+
+        One camera that was knocked is likelier than four that drifted.
+        """
         square = np.einsum("ci,cij,cj->c", self.xi, self.information, self.xi)
         return self.information * ((_FREEDOM + 6.0) / (_FREEDOM + square))[:, None, None]
 
-    def stepped(self, change: Array) -> CameraCorrections:
-        """The corrections (C, 6) further."""
+    def updated(self, change: Array) -> CameraCorrections:
+        """Corrections after adding a change (C, 6)."""
         return replace(self, xi=self.xi + change)

@@ -1,9 +1,8 @@
-"""How high the head reaches: its highest centimetres are seen at a slant and give no reading, but
-where they end the booth is seen behind them.
+"""Rows for the top of the head, which gives no depth readings: the cameras see it at a slant.
 
-In a column of an image the head's last reading, a gap and the booth's first reading follow each
-other; the head ends half a pixel before the latter. Of a tall person's head, with no booth behind,
-the last reading alone says how high it reaches at the least.
+Each column of an image has the last reading of the head, a gap and the first reading of the booth
+behind it. The head ends half a pixel before the first reading of the booth. Where there is no booth
+behind the head, its last reading gives a lower bound of its height.
 """
 
 from __future__ import annotations
@@ -20,76 +19,73 @@ from station.core.depth_image import Image
 from station.core.geometry import invert, transform
 from station.core.lens import project
 from workers.cloud.observed import CameraView
+from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _CROWN_M = 0.05
-"""The head ends within so much of its highest point, unless a camera looks down on it."""
+"""Outlines count within this height below the head's highest point; a camera that looks down sees
+the outline of lower places."""
 _CAP_M = 0.07
-"""What is drawn: deep enough that its lower rim is not taken for an outline."""
+"""Height of the part of the head that is drawn: enough that its lower rim is no outline."""
 _LEVEL = np.tan(np.radians(10.0))
-"""Slope of an outline along the rows: the projector stands beside the camera, its shadow falls
-along them. On a skull's radius of 15 cm it hides less than 0.7 px of what lies beyond such an
-outline, however wide it is."""
+"""Largest slope of an outline against the rows. The projector stands beside the camera, so its
+shadow falls along the rows: on a skull (radius 15 cm) it hides less than 0.7 px beyond an outline
+of this slope."""
 _SLOPE_PX = 3
+"""Columns to either side over which the slope is taken."""
 _REACH_PX = 16
+"""Rows above and below the outline that are searched for readings."""
 _WIDEST_PX = 12
-"""A wider gap is no slant but hair that gives no reading, and a stature is measured without."""
+"""Widest gap between the readings: a wider one is hair, which does not count to the stature."""
 _BEHIND_M = 0.08
+"""Least distance from the outline to the booth behind it."""
 _NEARER_M = 0.12
-"""The last reading of a flat skull is so much nearer than its outline."""
+"""Most by which the head's last reading may be nearer than the outline (flat skulls)."""
 _BEYOND_M = 0.0045
-"""So much of a head lies beyond its last reading: a Kinect reads up to 70 or 75 degrees of
-incidence, beyond which a radius of 8 to 12 cm leaves 3 to 7 mm."""
+"""Length of the head beyond its last reading: a Kinect reads up to 70 or 75 degrees of incidence,
+which leaves 3 to 7 mm of a radius of 8 to 12 cm."""
 _FARTHEST_M = 0.012
-"""No shape leaves a head off by so much: what is seen to end there is a bun, a hat, a hand."""
+"""Largest distance between the outline and the observed end: beyond it the cameras see a bun, a hat
+or a hand."""
 _LEAST_COLUMNS = 6
+"""Fewer columns are not used."""
 _SIGMA_M = 0.0015
-"""Of one camera's word, however many columns it has: half a pixel, or 0.05 degrees of its pose."""
+"""Standard deviation of one camera's observation, however many columns it has: half a pixel, or
+0.05 degrees of its pose."""
+_LEAST_WIDTH_PX = 1e-9
+"""Guards the division by the width of a line that stands upright in the image."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """Where n columns of images see the head end."""
-
-    vertex: Index
-    """(n,): at the body's outline."""
-    direction: Array
-    """(n, 3): unit, out of the outline."""
-    distance_m: Array
-    """(n,): from the outline to where the head ends, negative inwards."""
-    information: Array
-    """(n,): one over the variance."""
-
-
-_UNSEEN = Reach(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0))
+_NO_ROWS = Rows(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
 class _Cap:
-    """The head's highest part."""
+    """Highest part of the head."""
 
     vertex: Index
-    """(k,): of the body."""
+    """(k,): index among the body's vertices."""
     points: Array
-    """(k, 3)."""
+    """(k, 3), world frame, metres."""
     edges: Index
-    """(e, 2): between them."""
+    """(e, 2): pairs of indices into `points`."""
 
 
-def reach(
+def crown_rows(
     model: BodyModel, views: Sequence[CameraView], poses: Sequence[Array], vertices: Array
-) -> Reach:
-    """How far from the outline of a body (P, 3) cameras at poses (4, 4) see its head end."""
+) -> Rows:
+    """Rows that place the outline of the head where the cameras saw the head end.
+
+    Args:
+        poses: world_from_camera (4, 4) of each view.
+        vertices: (P, 3), the body's; the rows' places are its vertices.
+    """
     cap = _cap(model, vertices)
-    found = [_UNSEEN, *(_seen(view, pose, cap) for view, pose in zip(views, poses, strict=True))]
-    return Reach(
-        np.concatenate([one.vertex for one in found]),
-        np.concatenate([one.direction for one in found]),
-        np.concatenate([one.distance_m for one in found]),
-        np.concatenate([one.information for one in found]),
+    return Rows.joined(
+        _NO_ROWS, *(_rows_of(view, pose, cap) for view, pose in zip(views, poses, strict=True))
     )
 
 
@@ -105,21 +101,21 @@ def _cap(model: BodyModel, vertices: Array) -> _Cap:
 
 @lru_cache(maxsize=2)
 def _head(model: BodyModel) -> tuple[Index, Index]:
-    """The head's vertices, and the edges (e, 2) between them."""
+    """Vertices of the head, and the edges (e, 2) between them."""
     head = np.flatnonzero(model.part_of_vertex == model.part_names.index("head"))
     ends = sp.triu(model.adjacency[head][:, head]).nonzero()
     return head, np.stack(ends, axis=1).astype(np.intp)
 
 
-def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
-    """What one camera says."""
+def _rows_of(view: CameraView, pose: Array, cap: _Cap) -> Rows:
+    """Rows of one camera."""
     K, (height, width) = view.calibration.K, view.depth_m.shape
     local = transform(invert(pose), cap.points)
     places = np.nan_to_num(project(view.calibration, local), nan=-1.0)
     inside = (places[:, 1] > _REACH_PX) & (places[:, 1] < height - _REACH_PX - 1)
-    # An outline that leaves the image says nothing, nor does a head that is not in it.
+    # A head that is not wholly in the image is not used.
     if not inside.all():
-        return _UNSEEN
+        return _NO_ROWS
     out = 1 if pose[2, 1] > 0.0 else -1
     column, row, place = _outline(places * (1, out), cap.edges, width)
     row *= out
@@ -128,7 +124,7 @@ def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
     pixel_m = local[place, 2] / K[1, 1]
     slope = (row - K[1, 2]) / K[1, 1]
     length = np.hypot(1.0, slope)
-    # Out of the plane of the ray and the row.
+    # Normal of the plane through the ray and the image row.
     direction = out * (pose[:3, 1] - slope[:, None] * pose[:3, 2]) / length[:, None]
     high = cap.points[place, 2] > cap.points[:, 2].max() - _CROWN_M
     used = high & (booth >= 0)
@@ -136,22 +132,22 @@ def _seen(view: CameraView, pose: Array, cap: _Cap) -> Reach:
     if np.count_nonzero(used) < _LEAST_COLUMNS:
         used = high & (last >= 0)
         distance = out * (last - row) * pixel_m / length + _BEYOND_M
-        # Dark hair ends readings as well: they do not say that a head is lower.
+        # Dark hair gives no readings either, so a lower last reading does not mean a lower head.
         if not used.any() or np.median(distance[used]) < 0.0:
-            return _UNSEEN
+            return _NO_ROWS
     count = int(used.sum())
     if count < _LEAST_COLUMNS or abs(np.median(distance[used])) > _FARTHEST_M:
-        return _UNSEEN
+        return _NO_ROWS
     information = np.full(count, 1.0 / (count * _SIGMA_M**2))
-    return Reach(cap.vertex[place[used]], direction[used], distance[used], information)
+    return Rows(cap.vertex[place[used]], direction[used], distance[used], information)
 
 
 def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Index]:
-    """Columns in which a drawing ends level; how far along v; the nearer end of the line there.
+    """Columns with a level outline; the outline's row in each; the vertex nearest to it.
 
     Args:
-        places: (k, 2) pixels.
-        edges: (e, 2): lines between them.
+        places: (k, 2), pixels.
+        edges: (e, 2), the lines between them.
         width: number of columns.
     """
     start, stop = edges.T
@@ -163,7 +159,7 @@ def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Ind
     line = np.repeat(np.arange(len(edges)), count)
     column = np.arange(len(line)) + np.repeat(first - np.cumsum(count) + count, count)
     a, b = places[start[line]], places[stop[line]]
-    share = (column - a[:, 0]) / np.maximum(b[:, 0] - a[:, 0], 1e-9)
+    share = (column - a[:, 0]) / np.maximum(b[:, 0] - a[:, 0], _LEAST_WIDTH_PX)
     height = a[:, 1] + share * (b[:, 1] - a[:, 1])
     row = np.full(width + 2 * _SLOPE_PX, np.nan)
     inner = row[_SLOPE_PX:-_SLOPE_PX]
@@ -179,8 +175,11 @@ def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Ind
 def _ends(
     depth_m: Image, column: Index, row: Index, out: int, near_m: Array
 ) -> tuple[Index, Index]:
-    """(n,) each: the row of the booth's first reading beyond the head's last one, -1 where the gap
-    between them is wide or holds something else; the row of the last one where no booth is."""
+    """Rows (n,) where the booth begins behind the head, and where the head's readings end.
+
+    The first is -1 where the gap between the readings is wide or holds something else. The second
+    is given only where there is no booth behind the head, and is -1 elsewhere.
+    """
     # From inside to outside.
     rows = row[:, None] + out * np.arange(-_REACH_PX, _REACH_PX + 1)
     reading = depth_m[rows, column[:, None]]
@@ -189,7 +188,7 @@ def _ends(
     behind = farther > _BEHIND_M
     outer = np.argmax(behind, axis=1)
     read = np.where(reading > 0.0, np.arange(rows.shape[1]), -1)
-    # Where no booth is, outer is 0, and the last column holds the last reading of all.
+    # Without a booth `outer` is 0, so that `outer - 1` is the last column: the last reading of all.
     inner = np.maximum.accumulate(read, axis=1)[each, outer - 1]
     head = (inner >= 0) & (farther[each, inner] > -_NEARER_M)
     narrow = (outer > 0) & (outer - inner <= _WIDEST_PX)

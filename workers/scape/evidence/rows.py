@@ -1,4 +1,4 @@
-"""What pulls the body: distances along a direction at a vertex, and their sums at the samples."""
+"""Weighted linear rows on the body's displacement, and their sums at the sample vertices."""
 
 from __future__ import annotations
 
@@ -8,24 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.evidence.crown import Reach
 from workers.scape.evidence.free_space import FreeSpace
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
-_FLOOR_SIGMA_M = 0.004
-_FLOOR_SHARE = 0.02
-_SOLE_BAND_M = 0.003
-_FACING_DOWN = -0.8
 _OUTLINE_SIGMA_M = 0.004
+"""Standard deviation of a silhouette: about a pixel (3.4 mm at 2 m)."""
 _OUTLINE_EVERY = 3
-"""Neighbours see the same pixels."""
+"""Every so many vertices are tested: neighbours see the same pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """Places of the body that rows hold on to: all vertices, or some while the fit is coarse."""
+    """Surface points that rows refer to: all vertices, or some of them while the fit is coarse."""
 
     positions: Array
     """(k, 3)."""
@@ -34,26 +30,27 @@ class Skin:
     part: NDArray[np.int32]
     """(k,)."""
     share: Array
-    """(k,): the area that each stands for, in those of an average vertex."""
+    """(k,): area that each represents, in units of an average vertex's."""
     sample: NDArray[np.intp]
-    """(k,): the sample whose derivative each one takes."""
+    """(k,): index of the sample vertex whose derivative each one uses."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """n distances that ought to vanish."""
+    """n equations: direction . (displacement of a place) = residual, each with its weight."""
 
     place: NDArray[np.intp]
-    """(n,): of the skin."""
+    """(n,): index into the skin."""
     direction: Array
-    """(n, 3), unit."""
+    """(n, 3), unit vectors."""
     residual_m: Array
-    """(n,): how far the place should go along the direction."""
+    """(n,): distance that the place should move along the direction."""
     weight: Array
-    """(n,): one over the variance, times what the row counts."""
+    """(n,): inverse variance times the share with which the row counts."""
 
     @classmethod
     def joined(cls, *rows: Rows) -> Rows:
+        """All rows of several sets."""
         return cls(
             np.concatenate([one.place for one in rows]),
             np.concatenate([one.direction for one in rows]),
@@ -62,7 +59,10 @@ class Rows:
         )
 
     def at_samples(self, skin: Skin, count: int) -> tuple[Array, Array]:
-        """Sums for the samples: 3x3 weights (count, 3, 3) and pulls (count, 3)."""
+        """Sums over the rows of each sample: weights (count, 3, 3), weighted residuals (count, 3).
+
+        With d the direction, w the weight and r the residual: sum of w d d^T, sum of w r d.
+        """
         sample, direction = skin.sample[self.place], self.direction
         weight = np.empty((count, 3, 3))
         for i in range(3):
@@ -71,20 +71,29 @@ class Rows:
                 weight[:, i, j] = np.bincount(sample, weighted * direction[:, j], count)
                 weight[:, j, i] = weight[:, i, j]
         strength = self.weight * self.residual_m
-        pull = [np.bincount(sample, strength * direction[:, i], count) for i in range(3)]
-        return weight, np.stack(pull, axis=1)
+        total = [np.bincount(sample, strength * direction[:, i], count) for i in range(3)]
+        return weight, np.stack(total, axis=1)
+
+    def along(self, normals: Array) -> tuple[Array, Array]:
+        """Sums for displacements along normals (P, 3): information (P,), weighted residual (P,)."""
+        count = len(normals)
+        cosine = np.einsum("ni,ni->n", self.direction, normals[self.place])
+        strength = self.weight * cosine
+        information: Array = np.bincount(self.place, strength * cosine, count).astype(np.float64)
+        total: Array = np.bincount(self.place, strength * self.residual_m, count).astype(np.float64)
+        return information, total
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTerms:
-    """What the points' rows say of C cameras' corrections, and of them together with the body."""
+    """Parts of the normal equations that involve the corrections of C cameras."""
 
     normal: Array
     """(6 C, 6 C)."""
     gradient: Array
     """(6 C,)."""
     cross: Array
-    """(n, 3, 6 C): at each sample, how its pull changes with the corrections."""
+    """(n, 3, 6 C): derivative of each sample's weighted residual by the corrections."""
 
     @classmethod
     def build(
@@ -96,7 +105,14 @@ class CameraTerms:
         skin: Skin,
         count: int,
     ) -> CameraTerms:
-        """Of rows whose points, of cameras (n,), move by derivative (n, 6)."""
+        """Sum up rows (n,).
+
+        Args:
+            derivative: (n, 6), of each row's residual by the correction of its camera.
+            camera: (n,), index of that camera.
+            cameras: C.
+            count: number of samples.
+        """
         normal = np.zeros((6 * cameras, 6 * cameras))
         gradient = np.zeros(6 * cameras)
         cell = skin.sample[rows.place] * cameras + camera
@@ -115,27 +131,6 @@ class CameraTerms:
         return cls(normal, gradient, side_by_side.reshape(count, 3, 6 * cameras))
 
 
-def floor_rows(model: BodyModel, skin: Skin, reach_m: float) -> Rows:
-    """Each foot's lowest millimetres stand on z = 0, which no camera sees; the arch does not.
-
-    A foot that is farther from the floor than reach_m is left alone; nothing lies below the floor.
-    """
-    height = skin.positions[:, 2]
-    touching = height < 0.0
-    for side in ("left", "right"):
-        foot = skin.part == model.part_names.index(f"foot_{side}")
-        low = float(height[foot].min())
-        if abs(low) < reach_m:
-            touching |= foot & (height < low + _SOLE_BAND_M) & (skin.normals[:, 2] < _FACING_DOWN)
-    found = np.flatnonzero(touching)
-    return Rows(
-        found,
-        np.tile((0.0, 0.0, 1.0), (len(found), 1)),
-        -height[found],
-        _FLOOR_SHARE / _FLOOR_SIGMA_M**2 * skin.share[found],
-    )
-
-
 def outline_rows(
     model: BodyModel,
     free_space: FreeSpace,
@@ -143,9 +138,13 @@ def outline_rows(
     skin: Skin,
     row_share: float,
 ) -> Rows:
-    """Places go back from where a camera at its pose (4, 4) saw the booth behind them.
+    """Rows that move places out of pixels that show the background.
 
-    Not the hands: one curl for four fingers cannot keep an outline, and they have rims.
+    Hands are left out: with one joint for four fingers they cannot follow an outline, and they have
+    rims.
+
+    Args:
+        poses: world_from_camera (4, 4) of each camera.
     """
     found = free_space.intrusions(poses, skin.positions[::_OUTLINE_EVERY])
     place = _OUTLINE_EVERY * found.vertex
@@ -157,8 +156,3 @@ def outline_rows(
         -found.depth_m[kept],
         _OUTLINE_EVERY * row_share / _OUTLINE_SIGMA_M**2 * skin.share[place],
     )
-
-
-def crown_rows(reach: Reach) -> Rows:
-    """The head ends where the cameras see it end; a camera's word counts in full, once."""
-    return Rows(reach.vertex, reach.direction, reach.distance_m, reach.information)

@@ -1,4 +1,4 @@
-"""The fit of the SCAPE model to a cloud, step by step."""
+"""Fit of the SCAPE model to a cloud: start, joint estimation, surface, crossings, verdict."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from workers.cloud.observed import (
     Preprocessed,
 )
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.crown import reach
+from workers.scape.evidence.crown import crown_rows
 from workers.scape.evidence.rims import rims_of
+from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
 from workers.scape.fit.hands import place_hands
 from workers.scape.fit.initial import starting_states
 from workers.scape.fit.joint import JointResult, fit_jointly
+from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
-from workers.scape.fit.pull import Target, even_subset
 from workers.scape.fit.sampling import Sampling
-from workers.scape.fit.stages import COARSE, FINE, MIDDLE
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
@@ -50,29 +50,34 @@ Array = NDArray[np.float64]
 Method = Literal["joint", "paper"]
 Progress = Callable[[str, float], None]
 
-_TREE_POINTS = 30_000
-_COARSE_POINTS = 800
-_SCOUT_SAMPLES = 250
+_JOINT_POINTS = 30_000
+"""Points of the cloud that the joint fit uses."""
+_START_POINTS, _START_SAMPLES = 800, 250
+"""Points of the cloud and vertices of the model that starting poses are compared with."""
 _FACING_EVERY = 10
-"""Of the points: enough to tell where the toes are."""
+"""Every so many points are used to find the direction that the toes point in."""
 _MOST_STARTS = 4
+"""Starting poses that are tried at most."""
 _RIM_EVERY = 8
-"""So many of a hand's vertices say about where it is."""
+"""Every so many vertices of a hand are used to find it in an image."""
 _EXPLAINED = 0.008
+"""Share of unexplained points below which no other starting pose is tried."""
+_DELIVERED_DIGITS = 7
+"""Decimals of delivered coordinates in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitResult:
-    """A fitted body."""
+    """Fitted body with its quality."""
 
     state: BodyState
     vertices: Array
     """(P, 3): the surface, world frame, metres."""
     overlapping: Array
-    """(P, 3): the same before limbs that press into each other were taken apart: each with all its
-    flesh, as a tape finds it around a limb that is held away."""
+    """(P, 3): the surface before limbs that press into each other were separated. It is measured,
+    since each limb keeps the girth that it has when it is held away."""
     cloud: PointCloud
-    """What the surface was laid on: the scan's, its cameras corrected."""
+    """The scan's cloud after the corrections of the cameras."""
     vertex_sigma_m: Array
     """(P,): posterior standard deviation along the normal."""
     vertex_seen: NDArray[np.bool_]
@@ -83,21 +88,22 @@ class FitResult:
     correspondences: int
     iterations: int
     camera_shifts_m: dict[str, float]
-    """How far each camera's points had to move to agree with all others."""
+    """Distance by which each camera's points were moved to agree with the others."""
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class LaidBody:
-    """A body whose surface lies on the cloud; limbs may press into each other."""
+class OverlappingFit:
+    """Fitted body before limbs that press into each other are separated."""
 
     state: BodyState
     vertices: Array
     """(P, 3)."""
     surface: SurfaceFit
-    """The same, unrounded, with what is known of it."""
+    """The same surface, not rounded, with its standard deviations and residuals."""
     reference: Array | None
-    """(P, 3): the model's own surface in this state; None: the paper's, which is left as it is."""
+    """(P, 3): the model's surface in this state; None for the paper's method, whose surface is not
+    separated."""
     cloud: PointCloud
     correspondences: int
     iterations: int
@@ -107,7 +113,7 @@ class LaidBody:
 
 @lru_cache(maxsize=2)
 def sampling_of(model: BodyModel) -> Sampling:
-    """The model's samples: the same for every scan."""
+    """Sample vertices of a model, which are the same for every scan."""
     return Sampling.build(model)
 
 
@@ -124,36 +130,39 @@ def fit_body(
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
-    with one_thread_in_blas():
-        laid = lay_body(model, scan, method, progress, observer)
-        return take_apart(model, laid, scan.findings, observer)
+    with single_threaded_blas():
+        overlapping = fit_overlapping(model, scan, method, progress, observer)
+        return separate_limbs(model, overlapping, scan.findings, observer)
 
 
-def one_thread_in_blas() -> threadpool_limits:
-    """The order of its sums, and so every bit, stays the same; the other core has other work."""
+def single_threaded_blas() -> threadpool_limits:
+    """Limit BLAS to one thread, so that the order of its sums and therefore every bit is the same.
+
+    The other core is used by threads that run beside it.
+    """
     return threadpool_limits(limits=1, user_api="blas")
 
 
-def lay_body(
+def fit_overlapping(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
-) -> LaidBody:
-    """The first part of `fit_body`, after which a body can be measured.
+) -> OverlappingFit:
+    """First part of `fit_body`, after which the body can be measured.
 
     Raises:
         InputError: the cloud holds no body that could be fitted.
     """
     cloud = scan.cloud
-    _refuse_absurd(cloud)
+    _check(cloud)
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
-    scout = sampling.body.first(_SCOUT_SAMPLES)
-    most_points = len(cloud) if method == "paper" else _TREE_POINTS
-    few = cloud.points[even_subset(len(cloud), _COARSE_POINTS)]
+    few_samples = sampling.body.first(_START_SAMPLES)
+    most_points = len(cloud) if method == "paper" else _JOINT_POINTS
+    few = cloud.points[even_subset(len(cloud), _START_POINTS)]
     with ThreadPoolExecutor(1) as beside:
         building = beside.submit(Target.build, cloud, scan.views, most_points)
-        starts = starting_states(model, scout, few, cloud.points[::_FACING_EVERY])
+        starts = starting_states(model, few_samples, few, cloud.points[::_FACING_EVERY])
         target = building.result()
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
@@ -174,9 +183,9 @@ def lay_body(
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
-        crown = partial(reach, model, scan.views, cameras.poses(scan.views))
+        crown = partial(crown_rows, model, scan.views, cameras.poses(scan.views))
         surface = fit_surface(model, reference, cloud, cameras.corrected(joint.rims), crown)
-    return LaidBody(
+    return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),
         surface=surface,
@@ -193,44 +202,46 @@ def lay_body(
     )
 
 
-def take_apart(
-    model: BodyModel, laid: LaidBody, findings: Sequence[Finding], observer: Observer
+def separate_limbs(
+    model: BodyModel, fit: OverlappingFit, findings: Sequence[Finding], observer: Observer
 ) -> FitResult:
-    """The second part of `fit_body`: limbs that press into each other are parted, and judged."""
+    """Second part of `fit_body`: separate limbs that press into each other, and judge."""
     start = time.monotonic()
-    surface, vertices = laid.surface, laid.surface.vertices
-    if laid.reference is not None:
-        vertices = untangled(model, vertices, laid.reference)
+    surface, vertices = fit.surface, fit.surface.vertices
+    if fit.reference is not None:
+        vertices = untangled(model, vertices, fit.reference)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
-    parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, laid.cloud)
+    parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, fit.cloud)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
-    beta, shifts = laid.state.beta, laid.camera_shifts_m
+    beta, shifts = fit.state.beta, fit.camera_shifts_m
     verdict = judge(parts, sides, findings, unexplained, stature_m, beta, shifts)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(
-        state=laid.state,
+        state=fit.state,
         vertices=delivered,
-        overlapping=laid.vertices,
-        cloud=laid.cloud,
+        overlapping=fit.vertices,
+        cloud=fit.cloud,
         vertex_sigma_m=surface.sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
         verdict=verdict,
         point_to_surface_rms_m=rms_m,
         coverage=float(surface.seen.mean()),
-        correspondences=laid.correspondences,
-        iterations=laid.iterations,
-        camera_shifts_m=laid.camera_shifts_m,
-        seconds={**laid.seconds, "judge": time.monotonic() - start},
+        correspondences=fit.correspondences,
+        iterations=fit.iterations,
+        camera_shifts_m=fit.camera_shifts_m,
+        seconds={**fit.seconds, "judge": time.monotonic() - start},
     )
 
 
 def _rounded(vertices: Array) -> Array:
-    """Sums depend in their last bit on where arrays lie in memory; a tenth of a micrometre does
-    not: the same scan gives the same file."""
-    return np.round(vertices, 7)
+    """Vertices rounded to 0.1 micrometres, so that the same scan gives the same file.
+
+    The last bits of sums depend on where arrays lie in memory.
+    """
+    return np.round(vertices, _DELIVERED_DIGITS)
 
 
 def _best_start(
@@ -243,7 +254,7 @@ def _best_start(
     progress: Progress,
     observer: Observer,
 ) -> JointResult:
-    """Fit from the best start; from others too while a limb's worth of points stays unexplained."""
+    """Fit from the best start, and from others as long as too many points stay unexplained."""
     best, least = None, np.inf
     cameras = CameraCorrections.build(cloud, views)
     for start in starts[:_MOST_STARTS]:
@@ -254,10 +265,10 @@ def _best_start(
         if least < _EXPLAINED:
             break
     assert best is not None
-    done, steps = 0, len(MIDDLE) + len(FINE)
+    done, total = 0, len(MIDDLE) + len(FINE)
     hands = sampling.hands
     for schedule in (MIDDLE, FINE):
-        share = len(schedule) / steps
+        share = len(schedule) / total
         parts, places = model.part_of_vertex[::_RIM_EVERY], best.vertices[::_RIM_EVERY]
         bodies = [places[np.isin(parts, hand.parts)] for hand in hands]
         target = replace(target, rims=rims_of(views, cloud.camera_names, bodies))
@@ -270,7 +281,7 @@ def _best_start(
             state,
             best.cameras,
             schedule,
-            partial(_report, progress, done / steps, share),
+            partial(_report, progress, done / total, share),
             observer,
         )
         done += len(schedule)
@@ -281,9 +292,11 @@ def _report(progress: Progress, before: float, share: float, of_schedule: float)
     progress("icp", before + share * of_schedule)
 
 
-def _refuse_absurd(cloud: PointCloud) -> None:
+def _check(cloud: PointCloud) -> None:
     if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.normals).all()):
-        raise InputError("the cloud holds values that are not numbers; repair or scan again")
+        raise InputError(
+            "the cloud holds values that are not numbers; repair the file or scan again"
+        )
     if len(cloud) < LEAST_POINTS:
         raise InputError(f"the cloud has {len(cloud)} points; a body needs {LEAST_POINTS}")
     height_m = float(np.ptp(cloud.points[:, 2]))

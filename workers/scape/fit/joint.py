@@ -1,13 +1,13 @@
-"""Pose, shape and place at once: Gauss-Newton on two-way point-to-plane distances.
+"""Joint estimation of pose, shape and translation by Gauss-Newton on point-to-plane distances.
 
-Every correspondence is a point p, a vertex v and the vertex' normal n; its residual n . (p - y_v)
-is exact, its derivative that of the sample vertex nearest to v on the template, J_s (3 x D).
-While the fit is coarse, some sample vertices stand for the whole skin.
+Every correspondence is a point p, a vertex v and the vertex's normal n. Its residual n . (p - y_v)
+is exact, its derivative is that of the sample vertex nearest to v on the template, J_s (3 x D).
+While the fit is coarse, some sample vertices represent the whole surface.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -15,32 +15,50 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from station.core.geometry import so3_exp
 from workers.cloud.observed import PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.correspondence import Followers
+from workers.scape.evidence.correspondence import TrackedPoints
+from workers.scape.fit.annealing import AnnealingStep
+from workers.scape.fit.gauss_newton import (
+    DAMPING,
+    TwistPrior,
+    add_shape_prior,
+    shape_parameters,
+    updated,
+)
+from workers.scape.fit.normal_equations import (
+    DataTerms,
+    Target,
+    bound_rows,
+    data_terms,
+    probed_places,
+)
 from workers.scape.fit.observer import Observer, unobserved
-from workers.scape.fit.pull import DataTerms, Target, bounds, data_terms, probed_places
 from workers.scape.fit.sampling import Sampling
-from workers.scape.fit.stages import Stage
 from workers.scape.model.body_model import BodyModel, BodyState
-from workers.scape.model.sampled import twist_chain
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-_TWIST_INFLATION = 1.5
 _THUMB_STIFFNESS = 3.0
+"""A thumb has few points, which must not turn it into the palm."""
+_LEAST_WEIGHT, _WEIGHT_SLACK = 1e-12, 1e-9
+"""Added to the diagonal of each sample's weight, absolute and as a share of its trace, so that
+weights of rank 1 and 2 have a Cholesky factor."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointResult:
+    """State of the body and corrections of the cameras after a joint estimation."""
+
     state: BodyState
     cameras: CameraCorrections
     vertices: Array
+    """(P, 3), the model's surface."""
     rims: PointCloud
-    """Of the hands, as the target had them."""
+    """Outlines of the hands that were used."""
     correspondences: int
+    """Number of pairs in the last step."""
     iterations: int
 
 
@@ -50,28 +68,35 @@ def fit_jointly(
     target: Target,
     state: BodyState,
     cameras: CameraCorrections,
-    schedule: tuple[Stage, ...],
+    schedule: Sequence[AnnealingStep],
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
     observer: Observer = unobserved,
 ) -> JointResult:
-    """Minimise robust two-way distances with priors, coarse to fine."""
-    prior = _TwistPrior.build(model)
-    pulled = target.pulled
-    followers = Followers(
+    """Minimise robust two-way distances and priors, from coarse to fine.
+
+    Args:
+        sampling: sample vertices of the model.
+        cameras: corrections to start from.
+        schedule: settings of each step.
+        progress: called with the share of the steps that are done.
+    """
+    prior = TwistPrior.build(model, _THUMB_STIFFNESS)
+    subset = target.subset
+    tracked = TrackedPoints(
         model.neighbours,
-        np.concatenate([target.tree.points[pulled], target.rims.points]),
-        np.concatenate([target.tree.normals[pulled], target.rims.normals]),
+        np.concatenate([target.tree.points[subset], target.rims.points]),
+        np.concatenate([target.tree.normals[subset], target.rims.normals]),
     )
     terms: DataTerms | None = None
-    # What need not wait for one another is done side by side.
+    # Terms that do not depend on each other are computed in two threads.
     with ThreadPoolExecutor(max_workers=2) as beside:
-        for step, stage in enumerate(schedule):
-            samples = sampling.body.first(stage.samples)
-            derivative = beside.submit(samples.jacobian, state, stage.components)
-            skin = (sampling.coarse_skin if stage.coarse else sampling.skin)(model, state)
-            probed = beside.submit(probed_places, model, target, skin, stage)
-            bounding = beside.submit(bounds, model, target, cameras, skin, stage)
-            terms = data_terms(target, followers, probed, bounding, cameras, skin, stage)
+        for step, annealing in enumerate(schedule):
+            samples = sampling.body.first(annealing.samples)
+            derivative = beside.submit(samples.jacobian, state, annealing.components)
+            skin = (sampling.coarse_skin if annealing.coarse else sampling.skin)(model, state)
+            probed = beside.submit(probed_places, model, target, skin, annealing)
+            bounds = beside.submit(bound_rows, model, target, cameras, skin, annealing)
+            terms = data_terms(target, tracked, probed, bounds, cameras, skin, annealing)
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
@@ -83,70 +108,38 @@ def fit_jointly(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _TwistPrior:
-    """Gaussian over the relative twists, wider than the training poses."""
-
-    mean: Array
-    information: Array
-
-    @classmethod
-    def build(cls, model: BodyModel) -> _TwistPrior:
-        covariance = model.twist_covariance * _TWIST_INFLATION**2
-        covariance = covariance + np.radians(1.5) ** 2 * np.eye(len(covariance))
-        # The few points of a thumb must not turn it into the palm.
-        stiff = [
-            _THUMB_STIFFNESS if name.startswith("thumb") else 1.0 for name in model.part_names[1:]
-        ]
-        scale = np.repeat(stiff, 3)
-        information = np.linalg.inv(covariance) * scale[:, None] * scale[None, :]
-        return cls(model.twist_mean, information)
-
-
 def _step(
     model: BodyModel,
     state: BodyState,
     cameras: CameraCorrections,
     derivative: Array32,
     terms: DataTerms,
-    prior: _TwistPrior,
+    prior: TwistPrior,
 ) -> tuple[BodyState, CameraCorrections]:
-    """One Gauss-Newton step; derivative is that of the samples, (n, 3, D)."""
-    parts = model.part_count
+    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples."""
     size = derivative.shape[2]
-    active = size - 3 * parts - 3
+    shape = shape_parameters(model, size - 3 * model.part_count - 3)
     rows = derivative.reshape(-1, size)
     extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
-    # Half of the weights goes to either side: numpy then computes one triangle of the product.
-    slack = 1e-9 * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + 1e-12
+    # The weights are split between both sides: numpy then computes one triangle of the product.
+    slack = _WEIGHT_SLACK * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + _LEAST_WEIGHT
     half = np.linalg.cholesky(terms.weight + slack * np.eye(3)).astype(np.float32)
     weighted = (half.transpose(0, 2, 1) @ derivative).reshape(-1, size)
     normal[:size, :size] = weighted.T @ weighted
-    gradient[:size] = terms.pull.ravel().astype(np.float32) @ rows
-    shape = slice(3 * parts, 3 * parts + active)
-    normal[shape, shape] += np.eye(active)
-    gradient[shape] -= state.beta[:active]
-    change = twist_chain(model, state.rotations)
-    twists = model.relative_twists(state.rotations)[1:].ravel()
-    normal[: 3 * parts, : 3 * parts] += change.T @ prior.information @ change
-    gradient[: 3 * parts] -= change.T @ prior.information @ (twists - prior.mean)
+    gradient[:size] = terms.residual.ravel().astype(np.float32) @ rows
+    add_shape_prior(state, normal, gradient, shape)
+    prior.add(model, state, normal, gradient)
     body_only = np.arange(size)
-    normal[body_only, body_only] += 1e-6 * np.trace(normal) / size
+    normal[body_only, body_only] += DAMPING * np.trace(normal) / size
     if terms.cameras is not None:
-        bound = scipy.linalg.block_diag(*cameras.bound())
-        normal[size:, size:] = terms.cameras.normal + bound
-        gradient[size:] = terms.cameras.gradient - bound @ cameras.xi.ravel()
+        information = scipy.linalg.block_diag(*cameras.prior_information())
+        normal[size:, size:] = terms.cameras.normal + information
+        gradient[size:] = terms.cameras.gradient - information @ cameras.xi.ravel()
         together = rows.T @ terms.cameras.cross.reshape(-1, extra).astype(np.float32)
         normal[:size, size:] = -together
         normal[size:, :size] = -together.T
     delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
-    turned = np.clip(delta[: 3 * parts].reshape(-1, 3), -0.5, 0.5)
-    beta = state.beta.copy()
-    beta[:active] += delta[shape]
-    new = BodyState(
-        so3_exp(turned) @ state.rotations, beta, state.translation + delta[size - 3 : size]
-    )
     if extra:
-        cameras = cameras.stepped(delta[size:].reshape(-1, 6))
-    return new, cameras
+        cameras = cameras.updated(delta[size:].reshape(-1, 6))
+    return updated(state, delta, shape), cameras

@@ -1,4 +1,4 @@
-"""Who watches a fit: called with what each stage has at hand, and never asked for anything."""
+"""Observer of a fit: a function that is called with the arrays of each event."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
-Stage = Literal["cloud", "start", "correspondences", "joint", "surface", "done"]
+Event = Literal["cloud", "start", "correspondences", "joint", "surface", "done"]
 
 
 class Observer(Protocol):
-    """Watches a fit; must not write to the arrays, which are the fit's own.
+    """Function that is called at the events of a fit; it must not write to the arrays.
 
-    Stages in order, with their arrays (world frame, metres; P vertices of the template):
+    Events in order, with their arrays (world frame, metres; P vertices of the template):
 
-    - "cloud": `points` (n, 3), `normals` (n, 3), what is fitted to.
+    - "cloud": `points` (n, 3), `normals` (n, 3), the points that are fitted to.
     - "start": `vertices` (P, 3), the body before the first step.
     - "correspondences", once an iteration: `vertices` (P, 3), and `on_body` and `on_cloud`, (m, 3)
-      each, the pairs that pull it.
+      each, the pairs.
     - "joint": `vertices` (P, 3) of the fitted model.
-    - "surface": `vertices` (P, 3) laid on the data, `residual_m` (P,), the mean signed distance of
-      a vertex' points along its normal, NaN where it has none.
+    - "surface": `vertices` (P, 3) fitted to the data, `residual_m` (P,), mean signed distance of
+      a vertex's points along its normal, NaN where it has none.
     - "done": `vertices` (P, 3) as they are delivered.
     """
 
-    def __call__(self, stage: Stage, arrays: Mapping[str, NDArray[Any]]) -> None: ...
+    def __call__(self, event: Event, arrays: Mapping[str, NDArray[Any]]) -> None: ...
 
 
-def unobserved(stage: Stage, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Nobody watches."""
+def unobserved(event: Event, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Do nothing."""

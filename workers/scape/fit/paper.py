@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from station.core.errors import InputError
 from station.core.geometry import rigid_fit, transform
 from workers.scape.evidence.correspondence import compatible
+from workers.scape.fit.normal_equations import Target
 from workers.scape.fit.observer import Observer, unobserved
-from workers.scape.fit.pull import Target
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.displacement import SurfaceFit
@@ -51,9 +51,9 @@ def fit_like_the_paper(
         on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
         observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
         state = solve_pose_and_shape(model, mesh, pairs, target)
-        moved = solve_mesh(model.vertices(state), pairs, target)
-        change_m = float(np.sqrt(np.mean(np.sum((moved - mesh) ** 2, axis=1))))
-        mesh = moved
+        solved = solve_mesh(model.vertices(state), pairs, target)
+        change_m = float(np.sqrt(np.mean(np.sum((solved - mesh) ** 2, axis=1))))
+        mesh = solved
         progress(iteration / _MOST_ITERATIONS)
         if change_m < _SETTLED_M:
             break
@@ -99,9 +99,9 @@ def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array,
 
 def solve_pose_and_shape(model: BodyModel, mesh: Array, pairs: Pairs, target: Target) -> BodyState:
     """Step (b): theta, then beta, each by its own quadratic energy, for the mesh at its pairs."""
-    pulled = mesh.copy()
-    pulled[pairs[0]] = target.tree.points[pairs[1]]
-    return model.project(pulled, iterations=2, ridge=_SHAPE_RIDGE)
+    goal = mesh.copy()
+    goal[pairs[0]] = target.tree.points[pairs[1]]
+    return model.project(goal, iterations=2, ridge=_SHAPE_RIDGE)
 
 
 def solve_mesh(model_mesh: Array, pairs: Pairs, target: Target) -> Array:

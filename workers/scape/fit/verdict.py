@@ -1,4 +1,4 @@
-"""Can the result be trusted? Per-part residuals and coverage, in the operator's words."""
+"""Verdict on a fit, from the residuals and the coverage of each part of the body."""
 
 from __future__ import annotations
 
@@ -15,52 +15,72 @@ from workers.scape.model.deformation import vertex_areas, vertex_normals
 
 Array = NDArray[np.float64]
 
-_SEEN_ENOUGH = 0.22
-_EXTREMITY_SEEN_ENOUGH = 0.10
-_PART_RESIDUAL_M = 0.012
-_UNEXPLAINED_SHARE = 0.015
+_LEAST_COVERAGE = 0.22
+"""Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
+_LEAST_EXTREMITY_COVERAGE = 0.10
+"""The same for hands, feet, shoulders and the neck, which hide behind other parts."""
+_MOST_PART_RESIDUAL_M = 0.012
+"""Largest rms distance of a part's points to the surface: ten times that of a sound fit."""
 _UNEXPLAINED_M = 0.03
-_LOST_POINTS_SHARE = 0.001
-_UNMET_SHARE = 0.15
-_CAMERA_SHIFT_M = 0.002
-"""Rightly placed cameras are moved by tenths of a millimetre, one that is 5 mm off by 3 or more."""
-_STATURE_M = (1.30, 2.25)
-_IMPLAUSIBLE_BETA = 6.0
+"""Distance from the surface beyond which a point does not belong to the body."""
+_MOST_UNEXPLAINED = 0.015
+"""Largest share of such points in the whole scan."""
+_MOST_UNEXPLAINED_OF_PART = 0.15
+"""Largest share of such points among those nearest to one part: a lost limb has more."""
+_STRAY_SHARE = 0.001
+"""Share of the scan's points up to which unexplained points near a part are noise."""
+_MOST_CAMERA_SHIFT_M = 0.002
+"""Largest correction of a camera: well-placed cameras are moved by tenths of a millimetre, one that
+is 5 mm off its calibration by 3 mm or more."""
+_STATURES_M = (1.30, 2.25)
+"""Statures of adults, metres."""
+_MOST_BETA = 6.0
+"""Largest shape coefficient of the first components, in standard deviations of people."""
+_JUDGED_COMPONENTS = 10
+_POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
+"""Points used for the report on parts, and for the comparison of starts."""
 _TRUNK = ("pelvis", "abdomen", "chest")
 _SIDES = {"front": -1.0, "back": 1.0}
-"""The template faces -y."""
+"""Signs of y: the template faces -y."""
 _FACING = 0.7
+"""Least y component of the normals of a side."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
 
 @dataclass(frozen=True, slots=True)
 class PartReport:
-    """How well one part of the body was seen and met."""
+    """Coverage and residuals of one part of the body."""
 
     name: str
     coverage: float
-    """Share of its area that cameras saw."""
+    """Share of the part's area that cameras saw."""
     residual_rms_m: float
-    """Of the points that belong to it."""
-    unmet: float
-    """Share of the points around it that lie farther than 3 cm from it."""
+    """Rms distance of the part's points to the surface; NaN where it has none."""
+    unexplained: float
+    """Share of the points nearest to the part that lie farther than 3 cm from it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """ "ok" or "rescan", and why."""
+    """Whether to scan again, and the reasons in words for the operator."""
 
     status: str
+    """"ok" or "rescan"."""
     reasons: tuple[str, ...]
 
 
 def report_parts(
     model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: PointCloud
 ) -> tuple[tuple[PartReport, ...], float, float]:
-    """Reports by part, the point-to-surface rms in metres and the share of unexplained points."""
+    """Reports on all parts, the point-to-surface rms in metres, the share of unexplained points.
+
+    Args:
+        vertices: (P, 3), the fitted surface.
+        seen: (P,), vertices with points.
+    """
     areas = vertex_areas(vertices, model.faces)
     normals = vertex_normals(vertices, model.faces)
-    points, directions = _thinned(cloud, 10_000)
+    points, directions = _thinned(cloud, _POINTS_FOR_PARTS)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     offsets = points - vertices[vertex]
     away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
@@ -75,7 +95,7 @@ def report_parts(
         rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
         coverage = float(areas[mine & seen].sum() / areas[mine].sum())
         around = np.isin(part[vertex], members)
-        reports.append(PartReport(name, coverage, rms, _unmet(around, unexplained)))
+        reports.append(PartReport(name, coverage, rms, _unexplained_of(around, unexplained)))
     rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
     return tuple(reports), rms, float(unexplained.mean())
 
@@ -83,7 +103,7 @@ def report_parts(
 def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
     """Shares of the trunk's front and back that cameras saw.
 
-    A part that is seen from one side alone may still be seen by half.
+    Coverage by part does not show that one side is missing: half of each part is then still seen.
     """
     areas = vertex_areas(vertices, model.faces)
     toward = vertex_normals(model.mean, model.faces)[:, 1]
@@ -95,17 +115,17 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     return shares
 
 
-def _unmet(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
-    """A few stray points are noise; a cluster of them is a limb that the fit lost."""
+def _unexplained_of(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
+    """Share of unexplained points around a part, 0 where they are so few that they are noise."""
     lost = int(np.count_nonzero(around & unexplained))
-    if lost < _LOST_POINTS_SHARE * len(around):
+    if lost < _STRAY_SHARE * len(around):
         return 0.0
     return lost / int(np.count_nonzero(around))
 
 
 def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> float:
-    """Share of the points farther than 3 cm from the body's surface: a lost limb, a second body."""
-    points, directions = _thinned(cloud, 5000)
+    """Share of the points farther than 3 cm from the surface: a lost limb, a second person."""
+    points, directions = _thinned(cloud, _POINTS_FOR_STARTS)
     normals = vertex_normals(vertices, model.faces)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     away = np.linalg.norm(points - vertices[vertex], axis=1)
@@ -118,7 +138,7 @@ def _thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
 
 
 def _groups(model: BodyModel) -> dict[str, list[int]]:
-    """Parts as the operator names them: a hand with its fingers is one."""
+    """Parts by the operator's names: hand, thumb and fingers are one part, the hand."""
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(model.part_names):
         stem, _, side = name.rpartition("_")
@@ -136,39 +156,57 @@ def judge(
     beta: Array,
     camera_shifts_m: dict[str, float],
 ) -> Verdict:
-    """Decide whether to scan again."""
+    """Decide whether to scan again.
+
+    Args:
+        sides: shares of the trunk's front and back that were seen.
+        findings: what preprocessing noticed; each is a reason.
+        unexplained: share of the points that do not belong to the body.
+        beta: (B,), shape coefficients.
+        camera_shifts_m: how far the fit moved each camera's points.
+    """
     reasons = [finding.message for finding in findings]
-    if unexplained > _UNEXPLAINED_SHARE:
+    if unexplained > _MOST_UNEXPLAINED:
         reasons.append(
-            f"{100 * unexplained:.1f} % of what the cameras saw is not met by the body: a limb was "
-            "lost, or something else is in the booth"
+            f"{100 * unexplained:.1f} % of what the cameras saw does not belong to the measured "
+            "body: an arm or a leg is wrong, or something else is in the booth"
         )
-    if not _STATURE_M[0] < stature_m < _STATURE_M[1]:
-        reasons.append(f"the body is {stature_m:.2f} m tall; only adults can be measured")
-    if float(np.abs(beta[:10]).max(initial=0.0)) > _IMPLAUSIBLE_BETA:
+    low, high = _STATURES_M
+    if not low < stature_m < high:
+        reasons.append(
+            f"the person is {stature_m:.2f} m tall; only adults of {low:.2f} to {high:.2f} m can "
+            "be measured"
+        )
+    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MOST_BETA:
         reasons.append("what stands in the booth does not look like a person")
     for side, share in sides.items():
-        if share < _SEEN_ENOUGH:
-            reasons.append(f"the person's {side} not seen ({100 * share:.0f} % of it)")
+        if share < _LEAST_COVERAGE:
+            reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
     for part in parts:
-        words = words_of(part.name)
-        enough = _EXTREMITY_SEEN_ENOUGH if part.name.startswith(_EXTREMITIES) else _SEEN_ENOUGH
-        if part.coverage < enough:
-            reasons.append(f"{words} not seen ({100 * part.coverage:.0f} % of it)")
-        elif part.unmet > _UNMET_SHARE:
-            reasons.append(f"{words} not met by the fit ({100 * part.unmet:.0f} % of its points)")
-        elif part.residual_rms_m > _PART_RESIDUAL_M:
-            reasons.append(f"{words} not met ({1e3 * part.residual_rms_m:.0f} mm off)")
+        reasons += _part_reasons(part)
     for camera, shift in camera_shifts_m.items():
-        if shift > _CAMERA_SHIFT_M:
+        if shift > _MOST_CAMERA_SHIFT_M:
             reasons.append(
-                f"camera {camera} looks {1e3 * shift:.0f} mm or more off its calibration; "
-                "run station check"
+                f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
+                "run: station check"
             )
     return Verdict("rescan" if reasons else "ok", tuple(reasons))
 
 
-def words_of(part: str) -> str:
-    """A part's name as the operator reads it."""
+def _part_reasons(part: PartReport) -> list[str]:
+    words = part_in_words(part.name)
+    extremity = part.name.startswith(_EXTREMITIES)
+    if part.coverage < (_LEAST_EXTREMITY_COVERAGE if extremity else _LEAST_COVERAGE):
+        return [f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"]
+    if part.unexplained > _MOST_UNEXPLAINED_OF_PART:
+        share = f"{100 * part.unexplained:.0f} %"
+        return [f"the {words} does not match the scan ({share} of its points lie elsewhere)"]
+    if part.residual_rms_m > _MOST_PART_RESIDUAL_M:
+        return [f"the {words} does not match the scan ({1e3 * part.residual_rms_m:.0f} mm apart)"]
+    return []
+
+
+def part_in_words(part: str) -> str:
+    """Name of a part for the operator: "left forearm" of "forearm_left"."""
     stem, _, side = part.rpartition("_")
     return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part

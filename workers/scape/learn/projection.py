@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from station.core.geometry import so3_exp
+from workers.scape.fit.gauss_newton import shape_parameters, updated
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.sampled import SampledBody
 
@@ -20,7 +20,6 @@ _STEPS = 8
 _SETTLED_M = 2e-5
 _NOISE_M = 1e-3
 """Of each sample, against beta ~ N(0, I): the prior barely acts."""
-_MOST_TURN_RAD = 0.5
 
 
 def best_fit(
@@ -42,7 +41,7 @@ def best_fit(
     beta[active:] = 0.0
     state = replace(state, beta=beta)
     target = vertices[samples.indices]
-    shape = slice(3 * model.part_count, 3 * model.part_count + active)
+    shape = shape_parameters(model, active)
     for _ in range(_STEPS):
         positions, rows = samples.jacobian(state, active)
         size = rows.shape[2]
@@ -53,12 +52,7 @@ def best_fit(
         normal[np.diag_indices(size)] += 1.0
         gradient[shape] -= state.beta[:active]
         delta = scipy.linalg.solve(normal, gradient, assume_a="pos")
-        turns = np.clip(delta[: shape.start].reshape(-1, 3), -_MOST_TURN_RAD, _MOST_TURN_RAD)
-        beta = state.beta.copy()
-        beta[:active] += delta[shape]
-        state = BodyState(
-            so3_exp(turns) @ state.rotations, beta, state.translation + delta[shape.stop :]
-        )
+        state = updated(state, delta, shape)
         moved = flat @ delta.astype(np.float32)
         if np.sqrt(np.mean(np.square(moved))) < _SETTLED_M:
             break

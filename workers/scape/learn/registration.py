@@ -14,13 +14,19 @@ import open3d as o3d
 import scipy.linalg
 from numpy.typing import NDArray
 
-from station.core.geometry import so3_exp
 from workers.scape.evidence.correspondence import OrientedTree, compatible
+from workers.scape.fit.gauss_newton import (
+    DAMPING,
+    TwistPrior,
+    add_shape_prior,
+    shape_parameters,
+    updated,
+)
 from workers.scape.fit.hands import Hand, place_hands
 from workers.scape.fit.initial import starting_states
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import Faces, vertex_areas, vertex_normals
-from workers.scape.model.sampled import SampledBody, twist_chain
+from workers.scape.model.sampled import SampledBody
 
 Array = NDArray[np.float64]
 
@@ -30,8 +36,6 @@ _MOST_ANGLE_RAD = np.radians(60.0)
 _ACROSS = 0.05
 """Weight of a residual across the normal, against one along it."""
 _NOISE_M = 0.002
-_TWIST_INFLATION = 1.5
-_MOST_TURN_RAD = 0.4
 _SCHEDULE = (
     # components, gate and robust scale in metres, steps
     (6, 0.25, 0.060, 6),
@@ -73,10 +77,7 @@ def register(
     state = starting_states(model, scouts, vertices[::every], vertices)[0]
     share = _share_of_samples(model, samples)
     owner = _nearest_sample(model, samples)
-    information = np.linalg.inv(
-        _TWIST_INFLATION**2 * model.twist_covariance
-        + np.radians(1.5) ** 2 * np.eye(len(model.twist_mean))
-    )
+    prior = TwistPrior.build(model)
     cloud = OrientedTree.build(surface.points, surface.normals)
     for components, gate_m, scale_m, steps in _SCHEDULE:
         if components > model.beta_count:
@@ -84,7 +85,7 @@ def register(
             state = place_hands(model, hands, cloud, state, body, vertex_normals(body, model.faces))
         for _ in range(steps):
             weight, pull = _pairs(model, state, samples, surface, share, owner, gate_m, scale_m)
-            state = _step(model, samples, state, weight, pull, components, information)
+            state = _step(model, samples, state, weight, pull, components, prior)
     return state
 
 
@@ -190,25 +191,16 @@ def _step(
     weight: Array,
     pull: Array,
     components: int,
-    information: Array,
+    prior: TwistPrior,
 ) -> BodyState:
-    parts = model.part_count
     active = min(components, model.beta_count)
     _, rows = samples.jacobian(state, active)
     size = rows.shape[2]
     flat = rows.reshape(-1, size)
     normal = (flat.T @ (weight.astype(np.float32) @ rows).reshape(-1, size)).astype(np.float64)
     gradient = (flat.T @ pull.ravel().astype(np.float32)).astype(np.float64)
-    shape = slice(3 * parts, 3 * parts + active)
-    normal[shape, shape] += np.eye(active)
-    gradient[shape] -= state.beta[:active]
-    change = twist_chain(model, state.rotations)
-    off = model.relative_twists(state.rotations)[1:].ravel() - model.twist_mean
-    normal[: 3 * parts, : 3 * parts] += change.T @ information @ change
-    gradient[: 3 * parts] -= change.T @ information @ off
-    normal[np.diag_indices(size)] += 1e-6 * np.trace(normal) / size
-    delta = scipy.linalg.solve(normal, gradient, assume_a="pos")
-    turns = np.clip(delta[: 3 * parts].reshape(-1, 3), -_MOST_TURN_RAD, _MOST_TURN_RAD)
-    beta = state.beta.copy()
-    beta[:active] += delta[shape]
-    return BodyState(so3_exp(turns) @ state.rotations, beta, state.translation + delta[-3:])
+    shape = shape_parameters(model, active)
+    add_shape_prior(state, normal, gradient, shape)
+    prior.add(model, state, normal, gradient)
+    normal[np.diag_indices(size)] += DAMPING * np.trace(normal) / size
+    return updated(state, scipy.linalg.solve(normal, gradient, assume_a="pos"), shape)

@@ -193,7 +193,7 @@ def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def follow(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
+def descend(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
     """For each point, the node of a graph that no neighbour beats, reached downhill (m,), and
     whether it is within the limits (m,).
 
@@ -311,7 +311,7 @@ def _place(position, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: 
 
 
 @numba.njit(cache=True, nogil=True)
-def moved(points, group, turns, shifts):  # type: ignore[no-untyped-def]  # pragma: no cover
+def transform_groups(points, group, turns, shifts):  # type: ignore[no-untyped-def]  # pragma: no cover
     """(n, 3): points of groups (n,), each turned by its group's matrix (g, 3, 3), then shifted by
     its (g, 3)."""
     out = np.empty_like(points)

@@ -1,5 +1,7 @@
-"""Which triangles of a surface cross each other (numba; a sweep up a grid's columns finds the
-candidates)."""
+"""Pairs of triangles of a surface that cross each other (numba).
+
+Candidates are found by a sweep from bottom to top in every column of a grid.
+"""
 
 from __future__ import annotations
 
@@ -11,33 +13,34 @@ from workers.scape.model.deformation import Faces
 
 Array = NDArray[np.float64]
 
-_ROOM_M = 0.02
+_CELL_M = 0.02
+"""Cell size of the grid that finds triangles near those that are tested."""
 
 
 def crossing_pairs(
-    vertices: Array, faces: Faces, asking: NDArray[np.bool_] | None = None
+    vertices: Array, faces: Faces, tested: NDArray[np.bool_] | None = None
 ) -> NDArray[np.int32]:
     """Pairs (m, 2) of triangles that cross.
 
-    Triangles with one vertex in common count where they cross beyond it; those with an edge in
-    common cannot. Touching is not crossing.
+    Triangles that share a vertex count if they cross elsewhere; triangles that share an edge cannot
+    cross. Touching is not crossing.
 
     Args:
         vertices: (P, 3).
         faces: (K, 3).
-        asking: (K,): pairs of others are left out; everyone asks by default.
+        tested: (K,), pairs without one of these triangles are left out; all by default.
     """
     corners = np.ascontiguousarray(vertices[faces])
     lows, highs = _boxes(corners)
-    if asking is None:
-        asking = np.ones(len(faces), bool)
+    if tested is None:
+        tested = np.ones(len(faces), bool)
         near = np.arange(len(faces))
     else:
-        # What is far from all askers need not be looked at.
-        near = np.flatnonzero(_near(lows, highs, asking, _ROOM_M))
+        # Triangles far from all tested ones need not be compared.
+        near = np.flatnonzero(_near(lows, highs, tested, _CELL_M))
     upwards = near[np.argsort(lows[near, 2], kind="stable")]
     found = _crossing_pairs(
-        corners[upwards], lows[upwards], highs[upwards], faces[upwards], asking[upwards]
+        corners[upwards], lows[upwards], highs[upwards], faces[upwards], tested[upwards]
     )
     return np.sort(upwards[found], axis=1).astype(np.int32)
 
@@ -54,22 +57,22 @@ def _boxes(corners):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @numba.njit(cache=True, nogil=True)
-def _near(lows, highs, asking, room):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Boxes that share a room of a coarse grid with an asker's box."""
+def _near(lows, highs, tested, cell):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Mask of boxes that share a cell of a coarse grid with a tested one."""
     low, high = lows[0].copy(), highs[0].copy()
     for k in range(len(lows)):
         for c in range(3):
             low[c] = min(low[c], lows[k, c])
             high[c] = max(high[c], highs[k, c])
-    x1, y1, z1 = _room_of(high, low, room)
+    x1, y1, z1 = _cell_of(high, low, cell)
     occupied = np.zeros((x1 + 1, y1 + 1, z1 + 1), np.bool_)
-    near = asking.copy()
+    near = tested.copy()
     for marking in (True, False):
         for k in range(len(lows)):
-            if asking[k] != marking:
+            if tested[k] != marking:
                 continue
-            x0, y0, z0 = _room_of(lows[k], low, room)
-            x1, y1, z1 = _room_of(highs[k], low, room)
+            x0, y0, z0 = _cell_of(lows[k], low, cell)
+            x1, y1, z1 = _cell_of(highs[k], low, cell)
             for x in range(x0, x1 + 1):
                 for y in range(y0, y1 + 1):
                     for z in range(z0, z1 + 1):
@@ -81,23 +84,23 @@ def _near(lows, highs, asking, room):  # type: ignore[no-untyped-def]  # pragma:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _room_of(point, low, room):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _cell_of(point, low, cell):  # type: ignore[no-untyped-def]  # pragma: no cover
     return (
-        int((point[0] - low[0]) / room),
-        int((point[1] - low[1]) / room),
-        int((point[2] - low[2]) / room),
+        int((point[0] - low[0]) / cell),
+        int((point[1] - low[1]) / cell),
+        int((point[2] - low[2]) / cell),
     )
 
 
 @numba.njit(cache=True, nogil=True)
-def _crossing_pairs(corners, lows, highs, faces, asking):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Of triangles in the order of their lowest heights: a sweep upwards in every column."""
+def _crossing_pairs(corners, lows, highs, faces, tested):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Crossing pairs of triangles that are sorted by their lowest heights."""
     count = len(corners)
     extent = 0.0
     for k in range(count):
         for c in range(2):
             extent += highs[k, c] - lows[k, c]
-    # Wider than most triangles: few columns a triangle, few triangles at one height of a column.
+    # Wider than most triangles, so that a triangle is in few columns and a column is short.
     width = max(1.5 * extent / count, 1e-6)
     first = np.empty((count, 2), np.int64)
     last = np.empty((count, 2), np.int64)
@@ -147,9 +150,9 @@ def _crossing_pairs(corners, lows, highs, faces, asking):  # type: ignore[no-unt
                 ):
                     continue
                 b = triangle[j]
-                if a == b or not (asking[a] or asking[b]):
+                if a == b or not (tested[a] or tested[b]):
                     continue
-                # A pair is looked at in one column alone: the first that both are in.
+                # A pair is tested only in the first column that holds both.
                 x, y = max(first[a, 0], first[b, 0]), max(first[a, 1], first[b, 1])
                 if columns[i, 0] != x or columns[i, 1] != y:
                     continue
@@ -182,7 +185,7 @@ def _cross(corners, faces, a, b):  # type: ignore[no-untyped-def]  # pragma: no 
     b0, b1, b2 = _from_corner(corners, b, at_b)
     if _pierces(a1, a2, b0, b1, b2) or _pierces(b1, b2, a0, a1, a2):
         return True
-    # The edges that meet in a common corner go no farther.
+    # Edges that start in a common corner cannot pierce the other triangle.
     return shared == 0 and (
         _pierces(a0, a1, b0, b1, b2)
         or _pierces(a2, a0, b0, b1, b2)
@@ -193,7 +196,7 @@ def _cross(corners, faces, a, b):  # type: ignore[no-untyped-def]  # pragma: no 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _from_corner(corners, k, first):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """A triangle's corners from one of them on."""
+    """Corners of a triangle in order, starting with one of them."""
     i, j = (first + 1) % 3, (first + 2) % 3
     return (
         (corners[k, first, 0], corners[k, first, 1], corners[k, first, 2]),
@@ -204,7 +207,7 @@ def _from_corner(corners, k, first):  # type: ignore[no-untyped-def]  # pragma: 
 
 @numba.njit(cache=True, nogil=True)
 def _pierces(start, end, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Whether an edge goes through a triangle: by the signs of volumes."""
+    """Whether an edge passes through a triangle, by the signs of tetrahedra's volumes."""
     if _volume(a, b, c, start) * _volume(a, b, c, end) >= 0.0:
         return False
     u, v, w = _volume(start, end, a, b), _volume(start, end, b, c), _volume(start, end, c, a)
@@ -213,7 +216,7 @@ def _pierces(start, end, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no
 
 @numba.njit(cache=True, nogil=True)
 def _volume(a, b, c, d):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Six times that of a tetrahedron."""
+    """Six times the signed volume of a tetrahedron."""
     x0, x1, x2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     y0, y1, y2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     z0, z1, z2 = d[0] - a[0], d[1] - a[1], d[2] - a[2]

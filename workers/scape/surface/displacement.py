@@ -1,11 +1,14 @@
-"""The last millimetres: a displacement along the normals that lies on dense data and follows the
-model where nobody looked (the paper's E(Y'), with weights from the measured noise).
+"""Displacement of the fitted model's surface onto the cloud (the paper's E(Y'), with weights from
+the measured noise).
 
-    min_s  sum_v w_v (s_v - r_v)^2 + stiffness s^T L s,      Y' = Y + s n
+Every round minimises over the displacements s (P,) along the vertex normals n
 
-w_v and r_v gather all points that belong to vertex v; L is the template's graph Laplacian, so the
-field is smooth and fades over what no camera saw. Every round sets out from the last one's surface,
-with a narrower gate and less stiffness.
+    sum_v w_v (s_v - r_v)^2 + mu s^T (L + epsilon I) s,          Y' = Y + s n,
+
+where w_v and r_v sum up all points that belong to vertex v (information and mean distance), L is
+the graph Laplacian of the template and mu = 0.01 stiffness / (1 mm)^2. The field is smooth and
+fades where no camera saw the body. Each round starts from the surface of the one before, with a
+narrower gate and less stiffness.
 """
 
 from __future__ import annotations
@@ -19,35 +22,62 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
-from workers.scape.evidence.correspondence import Followers
-from workers.scape.evidence.crown import Reach
+from workers.scape.evidence.correspondence import TrackedPoints
+from workers.scape.evidence.floor import stand_on_floor
+from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import area_vectors, vertex_normals
 from workers.scape.model.kernels import conjugate_gradients
 
 Array = NDArray[np.float64]
 
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    gate_m: float
+    """Largest distance between a vertex and a point of it."""
+    angle_rad: float
+    """Largest angle between their normals."""
+    stiffness: float
+    """mu in units of _BENDING_UNIT / _STIFFNESS_SIGMA_M^2."""
+    tolerance: float
+    """Relative residual at which the solver stops."""
+
+
 _ROUNDS = (
-    # gate, angle, stiffness, tolerance of the solve
-    (0.030, np.radians(50), 240.0, 1e-2),
-    (0.020, np.radians(45), 48.0, 1e-2),
-    (0.012, np.radians(40), 12.0, 1e-3),
+    _Round(0.030, np.radians(50), 240.0, 1e-2),
+    _Round(0.020, np.radians(45), 48.0, 1e-2),
+    _Round(0.012, np.radians(40), 12.0, 1e-3),
 )
-_SIGMA_OF_STIFFNESS_M = 0.001
+_STIFFNESS_SIGMA_M = 0.001
+"""Data noise at which a stiffness is stated, metres."""
+_BENDING_UNIT = 1e-2
+"""Factor of the Laplacian term for a stiffness of 1 at that noise."""
 _FADE = 2.5e-5
-"""A weak pull towards the model, so that a field cannot drift where there are no data."""
+"""epsilon: weak pull towards the model, so that the field cannot drift where there are no data."""
+_MOST_SOLVER_STEPS = 250
+"""Conjugate gradient steps of a round, where the tolerance is not met before."""
 _INDEPENDENT = 0.25
-"""Share of a vertex' readings that count as independent: matching windows overlap."""
+"""Share of a vertex's readings that count as independent: the sensor's matching windows overlap."""
 _LEAST_SIGMA_M = 3e-4
-_SOLE_M = 0.03
-_LIFTED_M = 0.02
+"""Floor of a reading's standard deviation: quantisation and calibration do not average out."""
 _MOST_POINTS = 50_000
-"""More add nothing beyond what neighbouring readings share."""
+"""Points used at most: more add nothing beyond what neighbouring readings share."""
+_FLIP_LIMIT = 0.1
+"""A triangle counts as flipped when less than this share of its area vector is left."""
+_FLIP_TRIES, _FLIP_FACTOR = 4, 0.4
+"""How often, and by what factor, steps at flipped triangles are shortened."""
+_LEAST_MODEL_SIGMA_M = 5e-4
+"""Floor of the model's own standard deviation at a vertex, for the posterior."""
+_POSTERIOR_RINGS = 4
+"""Edges along which a vertex's information reaches its neighbours ..."""
+_POSTERIOR_DECAY = 0.5
+"""... and the share that is left after each."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceFit:
-    """A surface on the data. P vertices."""
+    """A surface fitted to a cloud. P vertices."""
 
     vertices: Array
     sigma_m: Array
@@ -55,7 +85,7 @@ class SurfaceFit:
     seen: NDArray[np.bool_]
     """(P,): points lie on the vertex or on a neighbour of it."""
     residual_m: Array
-    """(P,): mean signed distance of its points after the fit; NaN where there are none."""
+    """(P,): mean signed distance of the vertex's points after the fit; NaN where it has none."""
 
 
 def fit_surface(
@@ -63,38 +93,46 @@ def fit_surface(
     vertices: Array,
     cloud: PointCloud,
     rims: PointCloud,
-    crown: Callable[[Array], Reach],
+    crown: Callable[[Array], Rows],
 ) -> SurfaceFit:
-    """Lay the model's surface (P, 3) on the cloud's points, and on rims where the cloud ends.
+    """Fit the model's surface to a cloud, to the rims of the hands and to the top of the head.
 
-    Where a surface's crown is seen to end besides, a function of its vertices says: the field would
-    carry there, where no point is, what the points around it ask for.
+    Args:
+        vertices: (P, 3), the model's surface.
+        rims: outlines of the hands, where the cloud ends.
+        crown: rows for the top of the head, a function of the current vertices. There are no points
+            there, so the smooth field alone would carry on the trend of the points around it.
     """
     every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
     points = np.concatenate([cloud.points[every], rims.points])
     directions = np.concatenate([cloud.normals[every], rims.normals])
-    followers = Followers(model.neighbours, points, directions, dense=True)
+    tracked = TrackedPoints(model.neighbours, points, directions, dense=True)
     noise = np.concatenate([cloud.sigma_m[every], rims.sigma_m])
-    laplacian = _membrane(model)
+    laplacian = _graph_laplacian(model)
     identity = sp.identity(len(vertices), format="csr")
     current = vertices
-    for gate_m, angle_rad, stiffness, tolerance in _ROUNDS:
+    for round_ in _ROUNDS:
         normals = vertex_normals(current, model.faces)
-        residual, weight = _gathered(current, normals, followers, noise, gate_m, angle_rad)
-        residual, weight = _with_crown(residual, weight, normals, crown(current))
-        bending = stiffness / _SIGMA_OF_STIFFNESS_M**2 * 1e-2
+        residual, weight = _point_rows(current, normals, tracked, noise, round_)
+        residual, weight = _combined(residual, weight, *crown(current).along(normals))
+        bending = round_.stiffness / _STIFFNESS_SIGMA_M**2 * _BENDING_UNIT
         matrix = (sp.diags(weight) + bending * (laplacian + _FADE * identity)).tocsr()
         step = conjugate_gradients(
-            matrix.indptr, matrix.indices, matrix.data, weight * residual, tolerance, 250
+            matrix.indptr,
+            matrix.indices,
+            matrix.data,
+            weight * residual,
+            round_.tolerance,
+            _MOST_SOLVER_STEPS,
         )
-        step *= _hold(model, current, normals, step)
+        step *= _step_factor(model, current, normals, step)
         current = current + step[:, None] * normals
-    current = _stood_on_floor(model, current)
+    current = stand_on_floor(model, current)
     normals = vertex_normals(current, model.faces)
     # A rim says where the skin ends, not that a camera saw it.
     noise[len(noise) - len(rims) :] = np.inf
-    residual, weight = _gathered(current, normals, followers, noise, *_ROUNDS[-1][:2])
-    # A vertex between others that have points is seen as well: the template is finer than pixels.
+    residual, weight = _point_rows(current, normals, tracked, noise, _ROUNDS[-1])
+    # The template is finer than the pixels: a vertex between others that have points is seen too.
     seen = (abs(laplacian) @ weight) > 0
     return SurfaceFit(
         current, _posterior_sigma(model, weight), seen, np.where(weight > 0, residual, np.nan)
@@ -102,33 +140,31 @@ def fit_surface(
 
 
 @lru_cache(maxsize=2)
-def _membrane(model: BodyModel) -> sp.csr_matrix:
-    """L (P, P), the graph's: in two dimensions a membrane is as stiff in small triangles as in
-    large ones, so that ears and lips do not follow noise."""
+def _graph_laplacian(model: BodyModel) -> sp.csr_matrix:
+    """L (P, P) of the template's edges, without lengths.
+
+    In two dimensions such a membrane is as stiff in small triangles as in large ones, so that ears
+    and lips, which have small ones, do not follow the noise.
+    """
     degree = np.asarray(model.adjacency.sum(axis=1)).ravel()
     return (sp.diags(degree) - model.adjacency).tocsr()
 
 
-def _gathered(
-    vertices: Array,
-    normals: Array,
-    followers: Followers,
-    sigma_m: Array,
-    gate_m: float,
-    angle_rad: float,
+def _point_rows(
+    vertices: Array, normals: Array, tracked: TrackedPoints, sigma_m: Array, round_: _Round
 ) -> tuple[Array, Array]:
-    """Each vertex' mean distance (P,) to its points along their normals, and its information.
+    """Mean distance (P,) of each vertex to its points along their normals, and its information.
 
     The skin is curved and the template coarse: the points around a vertex lie below its tangent
     plane by half the square of their distance over the radius, and the vertex lies below theirs by
-    as much. Taken along the vertex' normal, the mean would draw a limb's vertices inwards, where
-    the polygon through them is short already; along the points' own normals it puts them as far
-    outside as the polygon's girth needs to be that of the curve, to second order.
+    as much. Along the vertex's normal, the mean would draw a limb's vertices inwards, where the
+    polygon through them is too short already. Along the points' own normals it moves them outwards
+    by as much as the polygon needs to have the girth of the curve, to second order.
     """
-    used, vertex = followers.pairs(
-        vertices, normals, max_distance_m=gate_m, max_angle_rad=angle_rad
+    used, vertex = tracked.pairs(
+        vertices, normals, max_distance_m=round_.gate_m, max_angle_rad=round_.angle_rad
     )
-    points, directions = followers.points, followers.normals
+    points, directions = tracked.points, tracked.normals
     distance = np.einsum("ni,ni->n", directions[used], points[used] - vertices[vertex])
     information = _INDEPENDENT / np.maximum(sigma_m[used], _LEAST_SIGMA_M) ** 2
     count = len(vertices)
@@ -137,58 +173,41 @@ def _gathered(
     return total / np.maximum(weight, 1e-12), weight
 
 
-def _with_crown(
-    residual: Array, weight: Array, normals: Array, crown: Reach
+def _combined(
+    residual: Array, weight: Array, more_weight: Array, more_total: Array
 ) -> tuple[Array, Array]:
-    """Distances along the normals (P,) and their information, and what the outlines say of them."""
-    count = len(weight)
-    along = np.einsum("ni,ni->n", crown.direction, normals[crown.vertex])
-    strength = crown.information * along
-    total = weight + np.bincount(crown.vertex, strength * along, count)
-    pull = weight * residual + np.bincount(crown.vertex, strength * crown.distance_m, count)
-    return pull / np.maximum(total, 1e-12), total
+    """Weighted mean distance (P,) and information (P,) of two sets of rows.
 
-
-def _stood_on_floor(model: BodyModel, vertices: Array) -> Array:
-    """Both feet on z = 0, which calibration knows and no camera sees the soles of.
-
-    The lowest centimetres of each foot are stretched or squeezed; a foot that is clearly lifted
-    stays where it is.
+    Args:
+        residual, weight: (P,), mean and information of the first set.
+        more_weight, more_total: (P,), information and weighted sum of the second.
     """
-    standing = vertices.copy()
-    for side in ("left", "right"):
-        foot = model.part_of_vertex == model.part_names.index(f"foot_{side}")
-        low = float(vertices[foot, 2].min())
-        if abs(low) > _LIFTED_M:
-            continue
-        near = foot & (vertices[:, 2] < _SOLE_M)
-        standing[near, 2] = (vertices[near, 2] - low) * _SOLE_M / (_SOLE_M - low)
-    return standing
+    total = weight + more_weight
+    return (weight * residual + more_total) / np.maximum(total, 1e-12), total
 
 
-def _hold(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
-    """1 where a step keeps every triangle's side, less where it would flip one."""
+def _step_factor(model: BodyModel, vertices: Array, normals: Array, step: Array) -> Array:
+    """Factors (P,) of a step: 1 where it flips no triangle, less where it would."""
     faces = model.faces
     before = area_vectors(vertices, faces)
     factor = np.ones(len(vertices))
-    for _ in range(4):
+    for _ in range(_FLIP_TRIES):
         after = area_vectors(vertices + (factor * step)[:, None] * normals, faces)
-        flipped = np.einsum("ki,ki->k", before, after) <= 0.1 * np.einsum(
+        flipped = np.einsum("ki,ki->k", before, after) <= _FLIP_LIMIT * np.einsum(
             "ki,ki->k", before, before
         )
         if not flipped.any():
             break
-        factor[np.unique(faces[flipped])] *= 0.4
+        factor[np.unique(faces[flipped])] *= _FLIP_FACTOR
     return factor
 
 
 def _posterior_sigma(model: BodyModel, weight: Array) -> Array:
-    """Standard deviation (P,): data and the model's own spread, diffused to the neighbours."""
-    prior = 1.0 / np.maximum(model.vertex_sigma_m, 5e-4) ** 2
+    """Standard deviation (P,) from the data, spread to the neighbours, and the model's own."""
+    prior = 1.0 / np.maximum(model.vertex_sigma_m, _LEAST_MODEL_SIGMA_M) ** 2
     laplacian = model.solver.laplacian
     degree = laplacian.diagonal()
     spread = weight.copy()
-    # What a vertex knows helps its neighbours within a few edges.
-    for _ in range(4):
-        spread = np.maximum(weight, 0.5 * (spread - (laplacian @ spread) / degree))
+    for _ in range(_POSTERIOR_RINGS):
+        spread = np.maximum(weight, _POSTERIOR_DECAY * (spread - (laplacian @ spread) / degree))
     return np.asarray(1.0 / np.sqrt(prior + spread))

@@ -1,0 +1,56 @@
+"""Schedule of the joint fit: from few shape components and wide gates to all and narrow ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workers.scape.fit.sampling import COARSE_SAMPLES, FINE_SAMPLES
+
+_ALL_COMPONENTS = 1 << 20
+"""More than any model has."""
+
+
+@dataclass(frozen=True, slots=True)
+class AnnealingStep:
+    """Settings of one Gauss-Newton step."""
+
+    samples: int
+    """Number of sample vertices."""
+    components: int
+    """Number of shape components that are estimated."""
+    gate_m: float
+    """Largest distance of a correspondence."""
+    angle_rad: float
+    """Largest angle between the normals of a correspondence."""
+    scale_m: float
+    """Scale of the robust weight: larger residuals are weighted down."""
+    row_share: float
+    """Share with which a row counts, since neighbouring rows share the model's error. It is low at
+    first, so that the prior keeps the face and the hands in shape while they move into place."""
+
+    @property
+    def coarse(self) -> bool:
+        """Whether sample vertices represent the whole surface."""
+        return self.samples == COARSE_SAMPLES
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limits of the correspondences, as keyword arguments."""
+        return {"max_distance_m": self.gate_m, "max_angle_rad": self.angle_rad}
+
+
+COARSE = (
+    *(AnnealingStep(COARSE_SAMPLES, 6, 0.20, np.radians(75), 0.060, 0.06) for _ in range(4)),
+    *(AnnealingStep(COARSE_SAMPLES, 16, 0.12, np.radians(65), 0.030, 0.06) for _ in range(4)),
+    *(AnnealingStep(COARSE_SAMPLES, 40, 0.08, np.radians(55), 0.018, 0.06) for _ in range(3)),
+)
+MIDDLE = tuple(
+    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.05, np.radians(45), 0.010, 0.06)
+    for _ in range(2)
+)
+FINE = tuple(
+    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 0.60)
+    for _ in range(3)
+)

@@ -1,0 +1,219 @@
+"""Data terms of one step of the joint fit: correspondences, floor, outlines, crown and rims.
+
+Rows of one sample vertex share its derivative, so they are summed up to a 3 x 3 weight and a
+weighted residual before they are multiplied by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workers.cloud.observed import CameraView, PointCloud
+from workers.scape.evidence.cameras import CameraCorrections
+from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
+from workers.scape.evidence.crown import crown_rows
+from workers.scape.evidence.floor import floor_rows
+from workers.scape.evidence.free_space import FreeSpace
+from workers.scape.evidence.rims import rims_of
+from workers.scape.evidence.rows import CameraTerms, Rows, Skin, outline_rows
+from workers.scape.fit.annealing import AnnealingStep
+from workers.scape.model.body_model import BodyModel
+
+Array = NDArray[np.float64]
+
+_MODEL_SIGMA_M = 0.003
+"""Standard deviation of what shape and pose cannot express. Neighbouring rows share it, which is
+why a row counts less than once."""
+_SUBSET_POINTS = 10_000
+"""Points that are paired with their nearest vertex."""
+_COARSE_EVERY = 4
+"""Every so many of these points are used while the fit is coarse."""
+_ASIDE = 2.0
+"""Largest distance of a point to a vertex, as a multiple of its distance along the normal."""
+_SPACING_M = 0.002
+"""Distance between neighbouring points."""
+_LEAST_FLOOR_TOLERANCE_M = 0.012
+_FLOOR_TOLERANCE_SHARE = 0.5
+"""Feet are placed on the floor if they are within this distance, or this share of the gate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Cloud, prepared for the search of correspondences."""
+
+    tree: OrientedTree
+    sigma_m: Array
+    subset: NDArray[np.intp]
+    """Indices of points that are paired with their nearest vertex; a fixed, even subset."""
+    coarse: OrientedTree
+    """Tree of this subset."""
+    free_space: FreeSpace
+    views: tuple[CameraView, ...]
+    """Views in the order of the cameras' corrections."""
+    camera: NDArray[np.integer]
+    """(n,): index of each point's camera."""
+    rims: PointCloud
+    """Outlines of the hands; empty until it is known where the hands are."""
+
+    @classmethod
+    def build(cls, cloud: PointCloud, views: Sequence[CameraView], most_points: int) -> Target:
+        """Prepare an even subset of at most `most_points` points."""
+        used = even_subset(len(cloud), most_points)
+        points, normals = cloud.points[used], cloud.normals[used]
+        subset = even_subset(len(used), _SUBSET_POINTS)
+        return cls(
+            OrientedTree.build(points, normals),
+            cloud.sigma_m[used],
+            subset,
+            OrientedTree.build(points[subset], normals[subset]),
+            FreeSpace.build(views),
+            tuple(views),
+            cloud.camera[used],
+            rims_of((), cloud.camera_names, ()),
+        )
+
+
+def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
+    """Sorted pseudo-random subset of indices; the same for the same arguments."""
+    if count <= wanted:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(count).choice(count, wanted, replace=False))
+
+
+@dataclass(frozen=True, slots=True)
+class DataTerms:
+    """Sums of the rows at n samples, and the m correspondences that they come from."""
+
+    weight: Array
+    """(n, 3, 3), sum of w d d^T over the rows of each sample."""
+    residual: Array
+    """(n, 3), sum of w r d."""
+    cameras: CameraTerms | None
+    """None while the corrections are kept fixed."""
+    on_body: Array
+    """(m, 3), vertices of the correspondences."""
+    on_cloud: Array
+    """(m, 3), their points."""
+
+
+def probed_places(
+    model: BodyModel, target: Target, skin: Skin, annealing: AnnealingStep
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Evenly spaced places of the skin that have a nearest point, and its index."""
+    cloud = target.coarse if annealing.coarse else target.tree
+    probes = np.arange(0, len(skin.share), max(1, len(skin.share) // (2 * annealing.samples)))
+    probing, found = cloud.pairs(skin.positions[probes], skin.normals[probes], **annealing.limits)
+    place = probes[probing]
+    if annealing.coarse:
+        return place, target.subset[found]
+    kept = ~np.isin(skin.part[place], model.hand_parts)
+    kept |= _along_normal(skin.positions[place], skin.normals[place], cloud.points[found])
+    return place[kept], found[kept]
+
+
+def _along_normal(places: Array, normals: Array, points: Array) -> NDArray[np.bool_]:
+    """Mask of points (n, 3) that lie along the normals of places (n, 3) rather than beside them.
+
+    The tip of a finger gives no readings. Its nearest point is on the border of the cloud and would
+    shorten the finger (Turk & Levoy 1994 leave out such pairs at a mesh's border).
+    """
+    offset = points - places
+    away = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+    ahead = np.abs(np.einsum("ni,ni->n", offset, normals))
+    return np.asarray(away < _ASIDE * ahead + _SPACING_M)
+
+
+def bound_rows(
+    model: BodyModel,
+    target: Target,
+    cameras: CameraCorrections,
+    skin: Skin,
+    annealing: AnnealingStep,
+) -> tuple[Rows, ...]:
+    """Rows of the floor and, in the fine steps, of the outlines and the top of the head."""
+    tolerance_m = max(_LEAST_FLOOR_TOLERANCE_M, _FLOOR_TOLERANCE_SHARE * annealing.gate_m)
+    floor = floor_rows(model, skin, tolerance_m)
+    if annealing.coarse:
+        return (floor,)
+    poses = cameras.poses(target.views)
+    outline = outline_rows(model, target.free_space, poses, skin, annealing.row_share)
+    return floor, outline, crown_rows(model, target.views, poses, skin.positions)
+
+
+def data_terms(
+    target: Target,
+    tracked: TrackedPoints,
+    probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
+    bounds: Future[tuple[Rows, ...]],
+    cameras: CameraCorrections,
+    skin: Skin,
+    annealing: AnnealingStep,
+) -> DataTerms:
+    """Correspondences and bounds, summed up at the samples.
+
+    Args:
+        tracked: the target's subset of points, followed by its rims.
+        probed: result of `probed_places`.
+        bounds: result of `bound_rows`.
+    """
+    cloud = target.tree
+    if annealing.coarse:
+        subset = target.subset[::_COARSE_EVERY]
+        paired, mine = OrientedTree.build(skin.positions, skin.normals).pairs(
+            cloud.points[subset], cloud.normals[subset], **annealing.limits
+        )
+    else:
+        subset = target.subset
+        paired, mine = tracked.pairs(skin.positions, skin.normals, **annealing.limits)
+        border = int(np.searchsorted(paired, len(subset)))
+        rimmed, at_rims = paired[border:] - len(subset), mine[border:]
+        paired, mine = paired[:border], mine[:border]
+    probes, found = probed.result()
+    place = np.concatenate([mine, probes])
+    point = np.concatenate([subset[paired], found])
+    on_body, camera = skin.positions[place], target.camera[point]
+    on_cloud = cameras.apply(cloud.points[point], camera)
+    direction = skin.normals[place]
+    rows = [_point_rows(place, direction, on_cloud - on_body, target.sigma_m[point], annealing)]
+    camera_terms = None
+    if not annealing.coarse:
+        if len(cameras):
+            derivative = cameras.derivative(on_cloud, camera, direction)
+            camera_terms = CameraTerms.build(
+                rows[0], derivative, camera, len(cameras), skin, annealing.samples
+            )
+        rows.append(_rim_rows(target.rims, rimmed, cameras, skin, at_rims, annealing))
+    weight, residual = Rows.joined(*rows, *bounds.result()).at_samples(skin, annealing.samples)
+    return DataTerms(weight, residual, camera_terms, on_body, on_cloud)
+
+
+def _rim_rows(
+    rims: PointCloud,
+    rimmed: NDArray[np.intp],
+    cameras: CameraCorrections,
+    skin: Skin,
+    place: NDArray[np.intp],
+    annealing: AnnealingStep,
+) -> Rows:
+    """Rows that place the outlines of hands where cameras saw them end before the background."""
+    offset = cameras.apply(rims.points[rimmed], rims.camera[rimmed]) - skin.positions[place]
+    return _point_rows(place, rims.normals[rimmed], offset, rims.sigma_m[rimmed], annealing)
+
+
+def _point_rows(
+    place: NDArray[np.intp],
+    direction: Array,
+    offset: Array,
+    sigma_m: Array,
+    annealing: AnnealingStep,
+) -> Rows:
+    """Robustly weighted rows (Geman & McClure) for offsets (n, 3) along directions (n, 3)."""
+    residual = np.einsum("ni,ni->n", direction, offset)
+    robust = 1.0 / (1.0 + (residual / annealing.scale_m) ** 2) ** 2
+    variance = sigma_m**2 + _MODEL_SIGMA_M**2
+    return Rows(place, direction, residual, annealing.row_share * robust / variance)
