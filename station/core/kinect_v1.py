@@ -1,15 +1,39 @@
-"""A structured-light Kinect's errors in inverse depth, where they are the same at every range.
+"""The facts of a Kinect v1, each in one place: image, clock, raw readings, errors.
 
-Random error of depth 1.425e-3 z^2 m (Khoshelham & Elberink 2012), so 1.425e-3 1/m of inverse depth,
-growing as a surface is seen at a slant; steps of 1/8 px of disparity at a baseline of 75 mm and a
-focal length of 585 px; errors correlated over the matching window.
+Raw 11-bit disparities become depth by 0.1236 tan(raw / 2842.5 + 1.1863) metres for every unit, an
+approximation in wide use among libfreenect's users; each unit's deviation from it is smooth in
+depth and taken out by the calibration's depth correction.
+
+Errors are given in inverse depth, where they are the same at every range: the random error of depth
+is 1.425e-3 z^2 m (Khoshelham & Elberink 2012), so 1.425e-3 1/m of inverse depth, growing as a
+surface is seen at a slant; readings are 1/8 px of disparity apart; errors are correlated over the
+matching window. (The simulation has numbers of its own: it must not share what is assumed here.)
 """
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
+WIDTH, HEIGHT = 640, 480
+"""The depth image, pixels."""
+FOCAL_PX = 585.0
+"""Nominal; the calibration holds each unit's own."""
+BASELINE_M = 0.075
+"""From the infrared camera to the projector."""
+FRAME_RATE_HZ = 30.0
+TICK_HZ, TICK_BITS = 60_000_000, 32
+"""The device clock; it wraps every 71.6 s."""
+
+NO_READING = 2047
+"""The raw value of a pixel that sees no pattern."""
+DEPTH_SCALE_M = 1e-4
+"""Metres per unit of the depth frames: fine enough that rounding is lost in the noise."""
+_FARTHEST_M = 6.0
+
 RANDOM_SIGMA = 1.425e-3
 """Of one pixel that sees a surface squarely, 1/m."""
-STEP = 1.0 / (8.0 * 585.0 * 0.075)
+STEP = 1.0 / (8.0 * FOCAL_PX * BASELINE_M)
 """Between neighbouring readings, 1/m."""
 CORRELATED_PX = 32.0
 """Pixels that share one random error: a Gaussian window of 1.6 px has 4 pi 1.6^2."""
@@ -21,3 +45,23 @@ INDEPENDENT_HZ = 20.0
 """Frames a second of what is waved at 0.4 m/s whose errors are nearly independent: at 1.7 m it
 moves by 7 px in a twentieth of a second, over which the correlation of errors falls to a hundredth;
 neighbours among 30 a second share an eighth. More of them would seem to say more than they do."""
+
+
+def nominal_intrinsics() -> NDArray[np.float64]:
+    """K of the depth image (3x3, pixels) as the maker states it."""
+    return np.array(
+        [[FOCAL_PX, 0.0, (WIDTH - 1) / 2], [0.0, FOCAL_PX, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]]
+    )
+
+
+def depth_m_of_raw(raw: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Metres of raw values; 0 for no reading and for what lies beyond any use."""
+    depth = 0.1236 * np.tan(np.asarray(raw, np.float64) / 2842.5 + 1.1863)
+    usable = (np.asarray(raw) < NO_READING) & (depth > 0.0) & (depth < _FARTHEST_M)
+    return np.where(usable, depth, 0.0)
+
+
+TABLE: NDArray[np.uint16] = np.rint(depth_m_of_raw(np.arange(2048)) / DEPTH_SCALE_M).astype(
+    np.uint16
+)
+"""Depth frame value of each raw value, (2048,)."""

@@ -1,6 +1,6 @@
 """Kinect v1 through libfreenect (ctypes), or its replay library: the very same code.
 
-Raw 11-bit disparities become depth by the formula of station.sensors.raw11 for every unit: what a
+Raw 11-bit disparities become depth by the formula of station.core.kinect_v1 for every unit: what a
 unit deviates from it is smooth, and the calibration's depth correction takes it out.
 """
 
@@ -21,8 +21,8 @@ from pydantic import Field, model_validator
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
+from station.core.kinect_v1 import FRAME_RATE_HZ, HEIGHT, TABLE, WIDTH
 from station.sensors.base import DepthFrame, DeviceInfo
-from station.sensors.raw11 import TABLE
 from station.sensors.recorded import kinect_v1
 from station.sensors.recording import check_recording
 
@@ -37,7 +37,6 @@ _LOG_ERROR = 1
 _WAITING_FRAMES = 4
 _SILENT_S = 3.0
 _FAILURES_IN_A_ROW = 3
-_FRAME_PERIOD_S = 1.0 / 30.0
 
 _DepthCallback = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32)
 
@@ -184,7 +183,7 @@ class FreenectDriver:
         del device
         received_s = time.monotonic()
         # A copy and no more: the library's clock waits for this call.
-        raw = np.frombuffer(ctypes.string_at(data, 2 * 640 * 480), np.uint16)
+        raw = np.frombuffer(ctypes.string_at(data, 2 * WIDTH * HEIGHT), np.uint16)
         arrived = _Arrival(raw, int(ticks), received_s, self._sequence)
         self._sequence += 1
         try:
@@ -203,7 +202,7 @@ class FreenectDriver:
                 # A USB transfer may be interrupted; only a device that is gone, or a recording at
                 # its end, fails again and again. Without a pause that would spin.
                 failures += 1
-                time.sleep(_FRAME_PERIOD_S)
+                time.sleep(1.0 / FRAME_RATE_HZ)
             else:
                 failures = 0
         if failures:
@@ -222,7 +221,7 @@ class FreenectDriver:
                 raise DriverError(f"{self._name} sends no frames; it is opened again") from None
             return None
         self._last_s = arrived.received_s
-        depth = TABLE[arrived.raw.reshape(480, 640) & 2047]
+        depth = TABLE[arrived.raw.reshape(HEIGHT, WIDTH) & 2047]
         return DepthFrame(depth, arrived.ticks, arrived.received_s, arrived.sequence)
 
     def _play_again(self) -> None:

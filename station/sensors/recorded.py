@@ -10,27 +10,31 @@ from pydantic import Field
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
+from station.core.kinect_v1 import (
+    DEPTH_SCALE_M,
+    HEIGHT,
+    TABLE,
+    TICK_BITS,
+    TICK_HZ,
+    WIDTH,
+    nominal_intrinsics,
+)
 from station.sensors.base import DepthFrame, DeviceInfo
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import check_recording, read_raw
-
-KINECT_V1_FOCAL_PX = 585.0
-TICK_HZ = 60_000_000
 
 
 def kinect_v1(serial: str) -> DeviceInfo:
     """A Kinect v1 with nominal intrinsics; the calibration holds the real ones."""
-    f = KINECT_V1_FOCAL_PX
     return DeviceInfo(
         serial=serial,
         model="kinect-v1",
-        width=640,
-        height=480,
-        K=np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]),
+        width=WIDTH,
+        height=HEIGHT,
+        K=nominal_intrinsics(),
         distortion=np.zeros(5),
         depth_scale_m=DEPTH_SCALE_M,
         tick_hz=TICK_HZ,
-        tick_bits=32,
+        tick_bits=TICK_BITS,
     )
 
 

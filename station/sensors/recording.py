@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.errors import FormatError
+from station.core.kinect_v1 import HEIGHT, WIDTH
 
 INDEX = "INDEX.txt"
-_HEADER = b"P5 640 480 65535\n"
-_SHAPE = (480, 640)
+_HEADER = f"P5 {WIDTH} {HEIGHT} 65535\n".encode()
+_SHAPE = (HEIGHT, WIDTH)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,15 +10,14 @@ from pydantic import Field
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError
+from station.core.kinect_v1 import DEPTH_SCALE_M, FRAME_RATE_HZ, TABLE, TICK_BITS, TICK_HZ
 from station.sensors.base import DepthFrame, DeviceInfo
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
-from station.sensors.recorded import TICK_HZ, RecordedCamera
+from station.sensors.recorded import RecordedCamera
 
 if TYPE_CHECKING:
     from station.simulation.sensor import VirtualFrame
 
 _LOOP_FRAMES = 24
-_FRAME_RATE_HZ = 30.0
 
 
 class SimulatedCamera(CameraConfig):
@@ -67,11 +66,11 @@ class VirtualDriver:
             distortion=calibration.distortion,
             depth_scale_m=DEPTH_SCALE_M,
             tick_hz=TICK_HZ,
-            tick_bits=32,
+            tick_bits=TICK_BITS,
         )
 
     def read(self, timeout_s: float) -> DepthFrame | None:
-        due_s = self._sequence / _FRAME_RATE_HZ
+        due_s = self._sequence / FRAME_RATE_HZ
         wait_s = self._start_s + due_s - time.monotonic()
         if wait_s > timeout_s:
             time.sleep(timeout_s)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.sensors.raw11 import NO_READING
+from station.core.kinect_v1 import NO_READING
 
 BASELINE_M = 0.075
 _WINDOW_PX = 9

@@ -11,9 +11,9 @@ from station.calibration.detect.ball import find_ball
 from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import static_view
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
 from station.sensors.clock import DeviceClock
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.simulation.procedure import (
     AROUND,
     BALL,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.errors import InputError
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import Rig
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import RecordedFrame
 from station.simulation.noise import TrueView, UnitError, observe
 from station.simulation.scene import (

@@ -24,8 +24,8 @@ from station.calibration.drift.motion import (
     estimate_move,
 )
 from station.core.geometry import se3_exp
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.simulation.noise import NoiselessView, TrueView
 from station.simulation.scene import Mesh, VirtualScene, fixed_posts, load_mesh
 from station.simulation.sensor import SimulatedBooth, SimulatedUnit

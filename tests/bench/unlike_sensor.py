@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.geometry import se3_exp
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import Rig
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.simulation.scene import Mesh
 from station.simulation.sensor import FRAME_RATE_HZ, TICK_HZ, SimulatedBooth, VirtualCamera
 

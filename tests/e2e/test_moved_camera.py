@@ -12,7 +12,7 @@ import pytest
 from running_station import Station
 
 from station.calibration.detect.scene import static_view
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import write_recording
 from station.simulation.scene import Mesh, fixed_posts, load_mesh
 from station.simulation.sensor import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames

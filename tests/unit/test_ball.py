@@ -10,8 +10,8 @@ from station.calibration.detect.detections import BallDetection, PlaneObservatio
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.core.errors import FormatError
 from station.core.geometry import invert, se3_exp, transform
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
 from station.simulation.noise import UnitError, observe
 from station.simulation.procedure import BALL, EMPTY, VirtualProcedure
 from station.simulation.round_objects import Capsule, ball, overlay

@@ -12,7 +12,7 @@ from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift.motion import LEVER_M, DriftReference, estimate_move
 from station.core.errors import FormatError
 from station.core.geometry import se3_exp
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.simulation.noise import TrueView, UnitError, observe
 from station.simulation.scene import (
     Mesh,

@@ -7,7 +7,7 @@ import pytest
 import synthetic_calibration as synthetic
 
 from station.core.errors import DriverError, FormatError, InputError
-from station.sensors.raw11 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
 from station.sensors.recording import check_recording, read_raw, write_recording
 from station.sensors.registry import make_driver
 from station.simulation.driver import SimulatedCamera
