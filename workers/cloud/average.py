@@ -1,4 +1,4 @@
-"""The robust mean of a few depth frames of a body that stands still."""
+"""Robust mean of a few depth frames of a body that stands still."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 from station.core.kinect_v1 import RANDOM_SIGMA, STEP
 
 _GATE_SIGMAS = 3.0
+"""Readings farther from the median than this, plus one disparity step, are left out."""
 _STRAY_READINGS = 2
+"""Readings that must be left out before a pixel counts as unsettled."""
+_LEAST_SHARE = 0.4
+"""Share of the frames in which a pixel needs a reading; flickering edges have fewer."""
 _MISSING = np.uint16(65535)
+"""Sorts missing readings last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +27,11 @@ class AveragedDepth:
     depth_m: NDArray[np.float32]
     """Mean of the readings near their median; 0 where too few agree."""
     count: NDArray[np.uint16]
-    """How many readings the mean is of."""
+    """Number of readings in the mean."""
     unsettled_m: NDArray[np.float32]
-    """Median where two or more readings lie far from it, as on a body that moved; 0 elsewhere."""
+    """Median where two or more readings are far from it, as on a body that moved; 0 elsewhere."""
     change_m: NDArray[np.float32]
-    """Mean of the last third less that of the first; NaN where either has no reading."""
+    """Mean of the last third of the frames minus that of the first; NaN without reading."""
 
 
 def random_sigma_m(depth_m: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -41,7 +46,7 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
     beyond three standard deviations and one disparity step of the median are left out.
     """
     frames = len(stack)
-    least = max(1, int(np.ceil(0.4 * frames)))
+    least = max(1, int(np.ceil(_LEAST_SHARE * frames)))
     depth = np.zeros(stack.shape[1:], np.float32)
     count = np.zeros(stack.shape[1:], np.uint16)
     change = np.full(stack.shape[1:], np.nan, np.float32)
@@ -53,12 +58,12 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
 
 @numba.njit(cache=True, nogil=True)
 def _average(stack, scale, least, third, depth, count, unsettled, change):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Row by row: what is done to all pixels of a row alike runs in vector registers."""
+    """Average row by row, so that the same operation on all pixels of a row is vectorised."""
     frames, height, width = stack.shape
     ordered = np.empty((frames, width), np.uint16)
     read = np.empty(width, np.uint16)
     median, gate = np.empty((2, width), np.float32)
-    # Each under a name of its own: rows by index would keep the compiler from vector registers.
+    # Separate names: the compiler does not vectorise rows that are addressed by an index.
     total, early, late = np.empty((3, width), np.float32)
     kept, kept_early, kept_late = np.empty((3, width), np.uint16)
     for y in range(height):
@@ -92,9 +97,9 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
 
 @numba.njit(cache=True, nogil=True)
 def _sort(stack, y, ordered, read):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """The readings of each pixel of a row, ascending, missing ones last, and how many were read.
+    """Sort the readings of each pixel of a row in ascending order, missing last, and count them.
 
-    Odd-even transposition sort: it compares whole rows with each other, whatever they hold.
+    Odd-even transposition sort, which compares whole rows and is therefore vectorised.
     """
     frames, _, width = stack.shape
     read[:] = 0
@@ -112,7 +117,7 @@ def _sort(stack, y, ordered, read):  # type: ignore[no-untyped-def]  # pragma: n
 
 @numba.njit(cache=True, nogil=True)
 def _add(row, scale, median, gate, total, kept):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add those readings of a row that lie within the gates of their medians."""
+    """Add the readings of a row that lie within the gates around their medians."""
     for x in range(len(row)):
         value = np.float32(row[x]) * scale
         agrees = (value > 0.0) & (abs(value - median[x]) <= gate[x])

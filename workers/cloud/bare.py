@@ -1,4 +1,4 @@
-"""A bare point cloud from any scanner as the fit wants it."""
+"""Point clouds and meshes from files, oriented and placed as the fit needs them."""
 
 from __future__ import annotations
 
@@ -17,35 +17,40 @@ Faces = NDArray[np.int32]
 
 _MOST_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
-_ASKED, _OTHERS = 25_000, 12_000
-"""Points that look for a body's other side, and among which."""
+"""Neighbours that a normal is estimated from."""
+_ORIENTED, _OPPOSITE = 25_000, 12_000
+"""Points whose normals are oriented, and points among which the body's other side is searched."""
 _DEPTHS_M = (0.06, 0.09, 0.13, 0.18, 0.24, 0.30)
-"""How thick a body is, from forearms to trunks."""
+"""Thicknesses of a body, from forearms to trunks."""
 _WIDENING, _SPACING_M = 0.25, 0.01
-"""How far beside a normal the other side may lie: it is slanted, and sampled."""
+"""Tolerance across the normal, as a share of the depth and absolute: the other side is slanted and
+sampled."""
 _NEARNESS_M = 0.15
-"""What lies nearer counts more: farther away there may be another limb."""
+"""Decay of a point's weight with its depth: farther away there may be another limb."""
 _VOTERS, _ROUNDS = 30, 8
+"""Neighbours that vote on a normal's sign, and how often."""
 _AGREED = 0.8
+"""Share of equal signs from which the propagated orientation is kept."""
 _SIGMA_M = 0.001
+"""Standard deviation that is assumed for the points of a file."""
 _UNSEEN_SOLES_M = 0.03
-"""A cloud that begins so little above its own z = 0 stands there: cameras see no soles."""
+"""A cloud that begins this little above its z = 0 stands on it: cameras do not see soles."""
 _OFF_FLOOR_M = 0.05
-"""How far a mesh's soles may be from the floor: heights are counted from there."""
+"""Largest distance of a mesh's soles from the floor, which heights are measured from."""
 
 
 def read_cloud(path: Path, up: str) -> PointCloud:
-    """Read a cloud in metres; its middle becomes the mark, and its lowest points the floor, unless
-    they lie as little above z = 0 as soles that no camera saw.
+    """Read a cloud in metres and move its middle to the mark and its lowest points to the floor.
 
-    Where that was in the file, after `up`, is the cloud's origin_m. The same file gives the same
-    points.
+    A cloud whose lowest points are slightly above z = 0, as where no camera saw the soles, keeps
+    its heights. `origin_m` of the cloud is the new origin in the file's frame, after `up`. The same
+    file gives the same points.
 
     Args:
         up: "z" or "y", the axis that points up.
 
     Raises:
-        InputError: the file is missing, is no cloud, or holds no numbers.
+        InputError: the file is missing, is not a cloud, or has values that are not finite.
     """
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a point cloud, .ply or .pcd")
@@ -88,11 +93,11 @@ def read_cloud(path: Path, up: str) -> PointCloud:
 
 
 def _consistent(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) that all look out of a body or all into it, of some that agree with their
-    neighbours.
+    """Normals (n, 3) that all point out of a body or all into it.
 
-    In the gaps between what two scanners saw such an agreement is lost: one side may then be turned
-    in while the other looks out. Where that is so, each is turned by what lies behind it.
+    The given normals agree with their neighbours. Across the gaps between two scanners' views that
+    agreement is lost, and one side may point inwards. In that case each normal is oriented by what
+    lies behind it.
     """
     turned = _turned_outwards(points, normals)
     share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
@@ -100,23 +105,23 @@ def _consistent(points: Array, normals: Array) -> Array:
 
 
 def _turned_outwards(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) of a body's points (n, 3), each turned out of it.
+    """Normals (n, 3) of a body's points (n, 3), each oriented outwards.
 
-    Behind the skin lies the body's other side, before it nothing or another limb, farther away.
-    Neighbours vote; between limbs and on hands it fails.
+    The body's other side lies behind the skin; in front of it there is nothing, or another limb
+    farther away. Neighbours vote on the sign. This fails between limbs and on hands.
     """
-    chosen = slice(None, None, max(1, len(points) // _ASKED))
-    asked, directions = points[chosen], normals[chosen]
-    others = cKDTree(points[:: max(1, len(points) // _OTHERS)])
-    outside = np.zeros(len(asked))
+    chosen = slice(None, None, max(1, len(points) // _ORIENTED))
+    oriented, directions = points[chosen], normals[chosen]
+    others = cKDTree(points[:: max(1, len(points) // _OPPOSITE)])
+    outside = np.zeros(len(oriented))
     for depth_m in _DEPTHS_M:
         gap_m = _WIDENING * depth_m + _SPACING_M
         for side in (1.0, -1.0):
-            place = asked + side * depth_m * directions
+            place = oriented + side * depth_m * directions
             away = others.query(place, distance_upper_bound=gap_m, workers=-1)[0]
             outside -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
-    tree = cKDTree(asked)
-    voters = tree.query(asked, _VOTERS, workers=-1)[1]
+    tree = cKDTree(oriented)
+    voters = tree.query(oriented, _VOTERS, workers=-1)[1]
     outwards = np.sign(outside)[:, None] * directions
     for _ in range(_ROUNDS):
         agreed = np.einsum("ni,ni->n", outwards[voters].sum(axis=1), directions) >= 0.0
@@ -127,14 +132,14 @@ def _turned_outwards(points: Array, normals: Array) -> Array:
 
 
 def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
-    """The vertices (P, 3) of a mesh file with the template's triangles (K, 3), z up.
+    """Vertices (P, 3), z up, of a mesh file with the template's triangles (K, 3).
 
     Args:
         up: "z" or "y", the axis that points up in the file.
 
     Raises:
-        InputError: the file is missing, is no mesh, holds no numbers, has other triangles, or is no
-            adult in metres who stands on the floor.
+        InputError: the file is missing, is not a mesh, has values that are not finite or other
+            triangles, or is not an adult in metres who stands on the floor.
     """
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a result folder or a mesh")
@@ -163,14 +168,14 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
 def _ply(path: Path) -> tuple[Array, Faces]:
     if path.suffix.lower() != ".ply":
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    # What is wrong with a file is said once, in our own words.
+    # Open3D's warnings would repeat the error that is raised.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(path)
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
 
 def _obj(path: Path) -> tuple[Array, Faces]:
-    """Vertices and triangles in the file's own order, which open3d's reader does not keep."""
+    """Vertices and triangles in the order of the file, which open3d's reader does not keep."""
     try:
         lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
         vertices = [words[1:4] for words in lines if words[:1] == ["v"]]

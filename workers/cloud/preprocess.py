@@ -1,4 +1,4 @@
-"""A scan bundle's frames as one cloud of one person, with what else the cameras say."""
+"""Preprocessing of a scan bundle: average, filter, crop and merge its frames to one cloud."""
 
 from __future__ import annotations
 
@@ -28,30 +28,48 @@ Mask = NDArray[np.bool_]
 
 _BILATERAL_DIAMETER_PX = 7
 _BILATERAL_RANGE_SIGMAS = 2.5
+"""Range parameter, in standard deviations of one reading at the person's distance."""
 _BILATERAL_SPACE_PX = 2.0
-_MAX_INCIDENCE_COSINE = np.cos(np.radians(76.0))
+_LEAST_INCIDENCE_COSINE = np.cos(np.radians(76.0))
+"""Readings at a larger angle of incidence are left out."""
+_WINDOW_BORDER_PX = 8
+"""Border around the person's part of the image, more than any filter reaches."""
 _VOXEL_M = 0.04
+"""Cell size for connected components."""
+_LEAST_READINGS_OF_CELL = 3
 _LEAST_POINTS = 2000
+"""Points in the volume below which the booth counts as empty."""
 _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 1.1
-"""A chair that stands apart harms nothing; another adult is another scan."""
+"""Another component with this share of the largest one's points and this height is a second person;
+a chair that stands apart is lower and is ignored."""
 _PEOPLE_STRIDE = 4
+"""Every so many points are used to count people."""
 _MOTION_M = 0.010
+"""Shift between the first and the last third of the frames from which a scan is repeated."""
 _MOTION_STRIDE = 4
 _LEAST_MOVING = 125
-"""Neighbours moved alike."""
+"""Every so many points are used for the shift, since neighbours move alike, and at least so many
+are needed."""
+_MOTION_OUTLIER, _MOTION_OUTLIER_M = 3.0, 1e-4
+"""Depth changes beyond so many median absolute ones are left out."""
+_MOTION_RIDGE = 1e-2
+"""Share of the identity added to the mean of n n^T: directions that no normal shows stay 0."""
 _UNSETTLED_SHARE = 0.25
+"""Share of unsettled readings from which a scan is repeated."""
+_LEAST_FRAMES_SHARE = 0.5
+"""Share of the expected frames below which a camera is reported."""
 _PLENTY_OF_FRAMES = 10
-"""A scan that has so many lacks none, however long it took to get them."""
+"""Frames that are enough, however many others were lost."""
 _SIGMA_FLOOR_M = 4e-4
-"""What averaging more frames does not take away: quantisation, calibration."""
+"""Standard deviation that averaging more frames does not remove: quantisation, calibration."""
 
 
 def warm_up() -> None:
-    """Compile (or load from the cache) what the first scan would otherwise wait for."""
+    """Compile, or load from the cache, the functions that the first scan needs."""
     average(np.zeros((3, 2, 2), np.uint16), 1e-4)
     nothing = np.zeros((1, 1, 3), np.float32)
-    # As `rays` gives them: what may be written to is another type, compiled apart.
+    # Read-only, as `rays` gives them: writable arrays are another type to the compiler.
     nothing.flags.writeable = False
     within(nothing, np.zeros((1, 1), np.float32), np.eye(4), np.zeros(3), np.zeros(3))
     normals(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32))
@@ -59,7 +77,7 @@ def warm_up() -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Camera:
-    """One camera's surface points inside the volume, flat."""
+    """Surface points of one camera inside the volume."""
 
     calibration: CameraCalibration
     depth_m: Image
@@ -69,10 +87,11 @@ class _Camera:
     sigma_m: Array
     change_m: Array
     unsettled: float
-    """Share of the readings in the volume that do not agree over the frames."""
+    """Share of the readings in the volume that disagree between frames."""
     frames: int
+    """Number of frames."""
     ordered: int
-    """How many it would have been but for gaps in their sequence, where that is few."""
+    """Number of frames without the gaps in their sequence, at most `_PLENTY_OF_FRAMES`."""
 
 
 def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
@@ -115,9 +134,10 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
             calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
             unsettled, len(bundle.frames[name]), _ordered(bundle, name),
         )  # fmt: skip
-    # Everything from here on is done on the person's part of the image alone.
-    top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, depth.shape[0])
-    left, right = max(columns[0] - 8, 0), min(columns[-1] + 9, depth.shape[1])
+    # The rest works only on the part of the image that shows the person.
+    border = _WINDOW_BORDER_PX
+    top, bottom = max(rows[0] - border, 0), min(rows[-1] + border + 1, depth.shape[0])
+    left, right = max(columns[0] - border, 0), min(columns[-1] + border + 1, depth.shape[1])
     window = np.s_[top:bottom, left:right]
     part = np.ascontiguousarray(depth[window])
     edge = jumps(part)
@@ -134,7 +154,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     directions, valid = normals(points, smooth)
     distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
     cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
-    valid &= near[window] & ~edge & (cosine > _MAX_INCIDENCE_COSINE)
+    valid &= near[window] & ~edge & (cosine > _LEAST_INCIDENCE_COSINE)
     at = np.flatnonzero(valid)
     y, x = np.unravel_index(at, valid.shape)
     readings = averaged.count[window].ravel()[at].astype(np.float64)
@@ -169,21 +189,21 @@ def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -
 
 
 def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
-    """The largest connected body in the booth; small pieces and furniture are left out."""
+    """Masks of the points of the largest connected component, and whether others are people."""
     everything = np.concatenate(points)
     if len(everything) < _LEAST_POINTS:
         raise InputError(
             "the booth is empty: the cameras see nobody in its volume; "
             "ask the person to stand on the mark, or check volume in booth.toml"
         )
-    # A coordinate a row: minima along long rows are quick.
+    # One coordinate per row: minima along long rows are fast.
     rows = everything.T.copy()
     low = rows.min(axis=1, keepdims=True) - 2 * _VOXEL_M
     cells = ((rows - low) / _VOXEL_M).astype(np.int64)
     shape = tuple(cells.max(axis=1) + 3)
     cell = np.ravel_multi_index(tuple(cells), shape)
     occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
-    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= 3))
+    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= _LEAST_READINGS_OF_CELL))
     of_point = labels.ravel()[cell]
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
@@ -206,7 +226,7 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
 def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
     person = np.zeros(camera.depth_m.shape, bool)
     person.flat[camera.pixels[keep]] = True
-    # Pixels at the person's edge are neither: no reading there says what lies behind.
+    # Pixels at the person's edge are neither person nor background.
     near_person = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     view = CameraView(
         name=camera.calibration.name,
@@ -234,26 +254,26 @@ def _camera_findings(expected: int, name: str, camera: _Camera, keep: Mask) -> l
     if not keep.any():
         message = f"camera {name} sees nothing of the person; check that it is not covered"
         found.append(Finding("camera-blind", name, None, message))
-    if camera.frames < 0.5 * expected:
+    if camera.frames < _LEAST_FRAMES_SHARE * expected:
         message = f"camera {name} gave {camera.frames} of {expected} frames; check its connection"
         found.append(Finding("frames-missing", name, float(camera.frames), message))
     moved_m = _motion(camera, keep)
     if moved_m > _MOTION_M:
-        message = f"the person moved {1e3 * moved_m:.0f} mm between frames (camera {name})"
+        message = f"the person moved by {1e3 * moved_m:.0f} mm during the scan (camera {name})"
         found.append(Finding("motion", name, moved_m, message))
     elif camera.unsettled > _UNSETTLED_SHARE:
         message = (
-            f"the person moved between frames: {100 * camera.unsettled:.0f} % of what camera "
-            f"{name} saw does not agree"
+            f"the person moved during the scan: {100 * camera.unsettled:.0f} % of the readings of "
+            f"camera {name} differ between frames"
         )
         found.append(Finding("motion", name, None, message))
     return found
 
 
 def _motion(camera: _Camera, keep: Mask) -> float:
-    """How far the person moved from the first third of the frames to the last, metres.
+    """Distance (m) that the person moved from the first third of the frames to the last.
 
-    The depth changes are explained by one shift t: n . t = (n . ray) change, in least squares.
+    Least squares for one shift t that explains the depth changes: n . t = (n . ray) change.
     """
     chosen = np.flatnonzero(keep & np.isfinite(camera.change_m))[::_MOTION_STRIDE]
     if len(chosen) < _LEAST_MOVING:
@@ -263,7 +283,7 @@ def _motion(camera: _Camera, keep: Mask) -> float:
     along = offsets / (offsets @ pose[:3, 2])[:, None]
     directions = camera.normals[chosen]
     shift = np.einsum("ni,ni->n", directions, along) * camera.change_m[chosen]
-    gate = 3.0 * np.median(np.abs(shift)) + 1e-4
+    gate = _MOTION_OUTLIER * np.median(np.abs(shift)) + _MOTION_OUTLIER_M
     used = np.abs(shift) < gate
-    normal = directions[used].T @ directions[used] + 1e-2 * used.sum() * np.eye(3)
+    normal = directions[used].T @ directions[used] + _MOTION_RIDGE * used.sum() * np.eye(3)
     return float(np.linalg.norm(np.linalg.solve(normal, directions[used].T @ shift[used])))
