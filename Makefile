@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 DEMO := demo
 BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
-.PHONY: help demo test check format train evaluate-model intervals clean $(BENCHES)
+.PHONY: help demo test check format train evaluate-model intervals lock package test-install clean \
+	$(BENCHES)
 
 help:
 	@echo "make demo     a booth of four replayed Kinects: calibrate, scan, print the result"
@@ -14,6 +15,9 @@ help:
 	@echo "make train    learn the body model anew (minutes)"
 	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
 	@echo "make intervals  calibrate the measurements' intervals anew, after any change to model or fit"
+	@echo "make package  the Debian packages, wheel and source distribution of this commit, in dist/"
+	@echo "make test-install   install them on a fresh Debian under systemd and put them to the test (root)"
+	@echo "make lock     pin the packages' dependencies anew"
 	@echo "make $(BENCHES)   tables of speed and accuracy"
 
 demo: $(VENV)/runtime.stamp
@@ -40,6 +44,16 @@ evaluate-model: $(VENV)/train.stamp
 intervals: $(VENV)/train.stamp
 	$(BIN)/python tests/bench/bench_measure.py --calibrate 96 $(ARGS)
 
+package: $(VENV)/dev.stamp
+	$(BIN)/python deploy/package/build.py $(ARGS)
+
+test-install: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -x -v tests/install $(ARGS)
+
+lock: $(VENV)/dev.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
+	$(BIN)/python deploy/package/update_lock.py
+
 # The benchmarks of fit and measurements render bodies that the model never saw, which takes
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
@@ -53,19 +67,19 @@ $(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
 	touch $@
 
 $(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[simulation]'
 	@echo "compiling what the first scan would otherwise wait for"
 	$(BIN)/python -c "from workers.reconstruct.job import warm_up; warm_up()"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,simulation]'
 	touch $@ $(VENV)/runtime.stamp
 
 $(VENV)/train.stamp: $(VENV)/dev.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'torch==2.13.0'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,train]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,train,simulation]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(DEMO) build *.egg-info
+	rm -rf $(VENV) $(DEMO) build dist *.egg-info

@@ -11,6 +11,12 @@ import click
 
 from station.core.errors import BoothError
 
+_OPTIONAL = {
+    "open3d": "this needs open3d, which a booth does without; apt install body-booth-simulation, "
+    "or pip install 'body-booth[simulation]'",
+}
+"""A library that may be missing -> what to do then."""
+
 
 class LazyGroup(click.Group):
     """Subcommands from a table: name -> ("module:attribute", one line of help)."""
@@ -45,4 +51,10 @@ def run(group: click.Group) -> None:
         group()
     except BoothError as error:
         click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except ModuleNotFoundError as error:
+        remedy = _OPTIONAL.get(error.name or "")
+        if remedy is None:
+            raise
+        click.echo(f"error: {remedy}", err=True)
         sys.exit(1)

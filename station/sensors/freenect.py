@@ -166,7 +166,7 @@ class FreenectDriver:
             raise DriverError(
                 f"{self._name} cannot be opened ({count} connected): check the serial with "
                 "freenect-camtest, whether another program uses it, and the permission "
-                "(install deploy/51-kinect.rules)"
+                "(install deploy/60-booth-cameras.rules)"
             )
         mode = library.freenect_find_depth_mode(_RESOLUTION_MEDIUM, _DEPTH_11BIT)
         # Kept as an attribute: the library calls it for as long as the device is open.

@@ -24,7 +24,7 @@ from workers.scape.fit.fit import FitResult
 from workers.scape.model.body_model import BodyModel
 
 STANDARD_POSE_FILE = "measurements-standard.json"
-_LIBRARIES = ("numpy", "scipy", "open3d-cpu", "opencv-contrib-python-headless", "cholespy")
+_LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 
 
 def write_result(

@@ -1,0 +1,339 @@
+"""`make package`: the Debian packages, the wheel and the source distribution of one commit.
+
+The same commit gives the same bytes: everything comes from `git archive` and hashed lock files, and
+every time is the commit's. The virtual environment is one compressed image that systemd mounts
+read-only on /opt/booth: a third of the disk, and an upgrade replaces it as a whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+BOOTH, SIMULATION = "body-booth", "body-booth-simulation"
+DEBIAN_PYTHON = Path("/usr/bin/python3.11")
+SITE = Path("lib/python3.11/site-packages")
+MOUNTED = {BOOTH: Path("/opt/booth"), SIMULATION: Path("/opt/booth.simulation")}
+"""Package -> where its image is mounted; a .pth file of the booth names the simulation's."""
+
+_NOT_SHIPPED = ("tests", "test")
+_NOT_SHIPPED_FILES = ("*.pyi", "*.h", "*.hpp", "*.cuh", "*.pxd", "*.pyx", "*.a", "*.lib")
+_NOT_SHIPPED_OPEN3D = ("open3d_tf_ops.so", "open3d_torch_ops.so")
+"""For machine learning frameworks that a booth has not."""
+
+_COMPILE = ("-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash")
+_LAUNCHER = """#!/opt/booth/bin/python -I
+import sys
+
+from {} import main
+
+sys.exit(main())
+"""
+_SQUASHFS = ("-comp", "zstd", "-Xcompression-level", "9", "-all-root", "-noappend", "-no-xattrs")
+_COMPRESSION = ("-Zxz", "-z0", "--threads-max=1")
+"""Of the Debian package; what is large in it is compressed already."""
+_MOUNT_UNIT = "opt-booth.simulation.mount"
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """What is built, and when it was made."""
+
+    name: str
+    seconds: int
+
+    @property
+    def version(self) -> str:
+        """Versions of later commits sort after those of earlier ones."""
+        stamp = time.strftime("%Y%m%d.%H%M%S", time.gmtime(self.seconds))
+        return f"{_project_version()}+git{stamp}.{self.name[:7]}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--commit", default="HEAD", help="what to package; default: HEAD")
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the files")
+    parser.add_argument("--work", type=Path, default=ROOT / "build/package", help="scratch folder")
+    parser.add_argument("--simulation", action="store_true", help=f"also {SIMULATION}")
+    arguments = parser.parse_args()
+    if not DEBIAN_PYTHON.exists():
+        sys.exit(f"error: {DEBIAN_PYTHON} is missing; packages are built on Debian 12")
+    seconds, name = _git("log", "-1", "--format=%ct %H", arguments.commit).split()
+    commit = Commit(name, int(seconds))
+    os.environ |= {"SOURCE_DATE_EPOCH": seconds, "PYTHONHASHSEED": "0", "TZ": "UTC"}
+    os.umask(0o022)
+    out, work = arguments.out.resolve(), arguments.work.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(work, ignore_errors=True)
+    source = _export(commit, work / "source")
+    wheel = build_python(source, work, out)
+    print(f"{_relative(build_booth(commit, source, wheel, work / BOOTH, out))}", flush=True)
+    if arguments.simulation:
+        tree = work / SIMULATION
+        print(f"{_relative(build_simulation(commit, source, tree, out))}", flush=True)
+
+
+def build_python(source: Path, work: Path, out: Path) -> Path:
+    """The wheel and the source distribution; returns the wheel."""
+    tools, made = work / "tools", work / "python"
+    _install(source / "deploy/lock/build.txt", tools)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", made, source],
+        env={**os.environ, "PYTHONPATH": str(tools)},
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+    (wheel,), (sdist,) = made.glob("*.whl"), made.glob("*.tar.gz")
+    _normalise(sdist)
+    for path in (wheel, sdist):
+        print(_relative(Path(shutil.copy(path, out))), flush=True)
+    return wheel
+
+
+def build_booth(commit: Commit, source: Path, wheel: Path, tree: Path, out: Path) -> Path:
+    """The booth's package: a virtual environment, units, rules, manuals."""
+    root = tree.with_suffix(".image")
+    site = root / SITE
+    _install(source / "deploy/lock/booth.txt", site)
+    _install(None, site, str(wheel))
+    (site / "booth-simulation.pth").write_text(f"{MOUNTED[SIMULATION]}\n")
+    _slim(site)
+    _virtual_environment(root)
+    _image(BOOTH, root, tree)
+    _copy_table(source, tree)
+    _manuals(source, tree, commit)
+    return _debian_package(BOOTH, commit, source, tree, out)
+
+
+def build_simulation(commit: Commit, source: Path, tree: Path, out: Path) -> Path:
+    """What the virtual booth and bare point clouds need besides: open3d and what it imports."""
+    root = tree.with_suffix(".image")
+    lock = tree.with_suffix(".txt")
+    lock.write_text(_difference(source / "deploy/lock/simulation.txt", source / "deploy/lock"))
+    _install(lock, root)
+    for name in _NOT_SHIPPED_OPEN3D:
+        (root / "open3d" / name).unlink(missing_ok=True)
+    _slim(root)
+    _image(SIMULATION, root, tree)
+    units = tree / "usr/lib/systemd/system"
+    units.mkdir(parents=True)
+    shutil.copyfile(source / "systemd" / _MOUNT_UNIT, units / _MOUNT_UNIT)
+    return _debian_package(SIMULATION, commit, source, tree, out)
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def _project_version() -> str:
+    import tomllib
+
+    return str(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
+
+
+def _relative(path: Path) -> Path:
+    return path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+
+
+def _export(commit: Commit, folder: Path) -> Path:
+    """The commit's files alone, with the commit's time: nothing of the working copy slips in."""
+    folder.mkdir(parents=True)
+    archive = subprocess.Popen(["git", "archive", commit.name], cwd=ROOT, stdout=subprocess.PIPE)
+    subprocess.run(["tar", "-x", "-C", folder], stdin=archive.stdout, check=True)
+    if archive.wait():
+        sys.exit(f"error: git archive {commit.name} failed")
+    return folder
+
+
+def _install(lock: Path | None, target: Path, *names: str) -> None:
+    """Install exactly what a lock file says, or a local wheel, without running anything of it."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    command += ["--no-deps", "--no-compile", "--target", str(target), "--upgrade"]
+    command += ["--require-hashes", "-r", str(lock)] if lock else ["--no-index", *names]
+    subprocess.run([*command, "--only-binary", ":all:"], check=True, stderr=_quiet())
+    # Programs of the dependencies, and notes on where pip found things, stay out.
+    shutil.rmtree(target / "bin", ignore_errors=True)
+    for note in [*target.glob("*.dist-info/direct_url.json"), *target.glob("*/REQUESTED")]:
+        note.unlink()
+
+
+def _quiet() -> int | None:
+    return None if sys.stderr.isatty() else subprocess.DEVNULL
+
+
+def _difference(lock: Path, folder: Path) -> str:
+    """The entries of one lock file that the booth's own does not have."""
+    known = {_name(entry) for entry in _entries(folder / "booth.txt")}
+    return "".join(entry for entry in _entries(lock) if _name(entry) not in known)
+
+
+def _entries(lock: Path) -> list[str]:
+    entries: list[str] = []
+    for line in lock.read_text().splitlines(keepends=True):
+        if line[:1].isalnum():
+            entries.append(line)
+        elif entries and not line.startswith("#"):
+            entries[-1] += line
+    return entries
+
+
+def _name(entry: str) -> str:
+    return entry.split("==")[0]
+
+
+def _slim(site: Path) -> None:
+    """Leave out the dependencies' own tests, headers and type stubs."""
+    for folder in [f for f in site.rglob("*") if f.is_dir() and f.name in _NOT_SHIPPED]:
+        shutil.rmtree(folder, ignore_errors=True)
+    for pattern in _NOT_SHIPPED_FILES:
+        for path in site.rglob(pattern):
+            path.unlink()
+
+
+def _image(name: str, root: Path, tree: Path) -> None:
+    """Compile to byte code that holds by content, since times say nothing, and compress."""
+    subprocess.run(
+        [DEBIAN_PYTHON, *_COMPILE, "-s", root, "-p", MOUNTED[name], root],
+        check=True,
+    )
+    place = tree / "usr/lib/body-booth"
+    place.mkdir(parents=True)
+    subprocess.run(
+        ["mksquashfs", root, place / f"{name}.squashfs", *_SQUASHFS, "-no-progress"],
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+
+
+def _virtual_environment(folder: Path) -> None:
+    """A relocatable environment on Debian's Python, with the two commands."""
+    programs = folder / "bin"
+    programs.mkdir(parents=True)
+    (programs / "python").symlink_to(DEBIAN_PYTHON)
+    (folder / "pyvenv.cfg").write_text(
+        "home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.11\n"
+    )
+    for name, module in (("station", "station.cli"), ("reconstruct", "workers.cli")):
+        program = programs / name
+        program.write_text(_LAUNCHER.format(module))
+        program.chmod(0o755)
+
+
+def _copy_table(source: Path, tree: Path) -> None:
+    """Copy what deploy/package/install.txt lists: source, target, one a line."""
+    for line in (source / "deploy/package/install.txt").read_text().splitlines():
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        pattern, target, *mode = words
+        found = sorted(source.glob(pattern))
+        if not found:
+            sys.exit(f"error: deploy/package/install.txt names {pattern}, which is not there")
+        for path in found:
+            place = tree / target / path.name if target.endswith("/") else tree / target
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, place)
+            place.chmod(int(mode[0], 8) if mode else 0o644)
+
+
+def _manuals(source: Path, tree: Path, commit: Commit) -> None:
+    """Manual pages and shell completion, made from the commands themselves."""
+    subprocess.run(
+        [sys.executable, source / "deploy/package/manuals.py", tree / "usr/share", commit.version],
+        env={**os.environ, "PYTHONPATH": str(source)},
+        check=True,
+    )
+
+
+def _debian_package(name: str, commit: Commit, source: Path, tree: Path, out: Path) -> Path:
+    folder = source / "deploy/package" / name
+    documents = tree / "usr/share/doc" / name
+    documents.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source / "deploy/package/copyright", documents / "copyright")
+    _compress(_changelog(name, commit), documents / "changelog.gz")
+    overrides = folder / "lintian-overrides"
+    if overrides.exists():
+        place = tree / "usr/share/lintian/overrides"
+        place.mkdir(parents=True)
+        shutil.copyfile(overrides, place / name)
+    control = tree / "DEBIAN"
+    control.mkdir()
+    for path in folder.iterdir():
+        if path.name in ("preinst", "postinst", "prerm", "postrm", "config"):
+            (control / path.name).write_text(path.read_text())
+            (control / path.name).chmod(0o755)
+        elif path.name in ("templates", "triggers"):
+            shutil.copyfile(path, control / path.name)
+    fields = (folder / "control").read_text().replace("@VERSION@", commit.version)
+    (control / "control").write_text(fields + f"Installed-Size: {_kilobytes(tree)}\n")
+    _write_sums(tree, control / "md5sums")
+    package = out / f"{name}_{commit.version}_amd64.deb"
+    subprocess.run(
+        ["dpkg-deb", "--root-owner-group", *_COMPRESSION, "--build", tree, package],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    return package
+
+
+def _changelog(name: str, commit: Commit) -> str:
+    date = time.strftime("%a, %d %b %Y %H:%M:%S +0000", time.gmtime(commit.seconds))
+    maintainer = "Body booth <maintainers@body-booth.example>"
+    return (
+        f"{name} ({commit.version}) unstable; urgency=medium\n\n"
+        f"  * Commit {commit.name}; see CHANGELOG.md.\n\n -- {maintainer}  {date}\n"
+    )
+
+
+def _compress(text: str, path: Path) -> None:
+    path.write_bytes(gzip.compress(text.encode(), mtime=0))
+
+
+def _kilobytes(tree: Path) -> int:
+    """Installed size as dpkg counts it: files rounded up to 1 KiB, a KiB for each other entry."""
+    total = 0
+    for path in tree.rglob("*"):
+        if "DEBIAN" not in path.relative_to(tree).parts:
+            plain = path.is_file() and not path.is_symlink()
+            total += -(-path.stat().st_size // 1024) if plain else 1
+    return total
+
+
+def _write_sums(tree: Path, path: Path) -> None:
+    files = sorted(f for f in tree.rglob("*") if f.is_file() and not f.is_symlink())
+    names = [str(f.relative_to(tree)) for f in files if f.relative_to(tree).parts[0] != "DEBIAN"]
+    with path.open("w") as sums:
+        subprocess.run(["md5sum", *names], cwd=tree, stdout=sums, check=True)
+
+
+def _normalise(sdist: Path) -> None:
+    """Write a source distribution anew: members in order, one owner, the commit's time."""
+    seconds = int(os.environ["SOURCE_DATE_EPOCH"])
+    with tarfile.open(sdist) as archive:
+        members = [
+            (m, archive.extractfile(m) if m.isfile() else None)
+            for m in sorted(archive.getmembers(), key=lambda member: member.name)
+        ]
+        plain = sdist.with_suffix("")
+        with tarfile.open(plain, "w", format=tarfile.PAX_FORMAT) as fresh:
+            for member, content in members:
+                member.mtime, member.uid, member.gid = seconds, 0, 0
+                member.uname = member.gname = ""
+                member.pax_headers = {}
+                fresh.addfile(member, content)
+    sdist.write_bytes(gzip.compress(plain.read_bytes(), mtime=seconds))
+
+
+if __name__ == "__main__":
+    main()
