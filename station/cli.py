@@ -28,6 +28,10 @@ COMMANDS = {
     "capture": ("station.booth.capture:capture", "one camera's capture process"),
     "sync": ("station.booth.sync:sync", "the sync-and-merge process"),
     "control": ("station.booth.control:control", "the operator's endpoint"),
+    "setup": ("station.administration.setup:setup", "make a booth of the cameras connected"),
+    "backup": ("station.administration.backup:backup", "save what makes this booth"),
+    "restore": ("station.administration.restore:restore", "bring a backup back"),
+    "migrate": ("station.administration.migrate:migrate_command", "bring old files up to date"),
     "record-virtual": ("station.simulation.record_cli:record_virtual", "record a virtual person"),
 }
 

@@ -1,0 +1,171 @@
+"""What a backup holds, and how it is written and read: a folder with a manifest of checksums."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from station.administration.booth_file import CONFIG, STATE_FOLDER
+from station.core.config import BoothConfig
+from station.core.errors import BoothError, FormatError
+from station.core.files import fsync_folder, private_folder, publish_folder, read_json, write_json
+from station.core.spool import STATES
+from station.sensors.freenect import FreenectCamera
+
+MANIFEST, CONTENT = "backup.json", "content"
+FORMAT = "booth-backup"
+VERSION = 1
+
+
+_SCRATCH = ("tmp", "locks")
+"""Folders of a spool that mean nothing without the processes that use them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A file or folder of the booth and its name in a backup."""
+
+    name: str
+    place: Path
+    personal: bool = False
+    """Scans of persons: saved only when asked for."""
+
+
+def parts(config_path: Path, config: BoothConfig) -> list[Part]:
+    """Everything that there is of a booth and makes it this booth."""
+    names = ["booth.toml", "calibration.json", "calibrations"]
+    names += [f"spool/{path.name}" for path in _entries(config.spool.folder)]
+    if config_path == CONFIG:
+        named = {config.calibration, config.calibrate.folder, config.spool.folder}
+        named |= {
+            camera.recording.parent
+            for camera in config.cameras
+            if isinstance(camera, FreenectCamera) and camera.recording
+        }
+        names += [f"state/{path.name}" for path in _entries(STATE_FOLDER) if path not in named]
+        names += [f"etc/{path.name}" for path in _entries(config_path.parent)]
+    found = [part(name, config_path, config) for name in names if name != "etc/booth.toml"]
+    return [one for one in found if one.place.exists()]
+
+
+def part(name: str, config_path: Path, config: BoothConfig) -> Part:
+    """Where a part of a backup belongs in the booth that is configured.
+
+    Raises:
+        FormatError: no backup has such a part.
+    """
+    named = {
+        "booth.toml": config_path,
+        "calibration.json": config.calibration,
+        "calibrations": config.calibrate.folder,
+    }
+    if name in named:
+        return Part(name, named[name])
+    folders = {
+        "spool": config.spool.folder,
+        "state": STATE_FOLDER,
+        "etc": CONFIG.parent,
+    }
+    group, _, rest = name.partition("/")
+    if group not in folders or not rest or "/" in rest or rest in (".", ".."):
+        raise FormatError(f"no backup has a part {name!r}")
+    return Part(name, folders[group] / rest, personal=group == "spool" and rest in STATES)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in a folder, without names that begin with a dot and without scratch."""
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [path for path in found if path.name[0] != "." and path.name not in _SCRATCH]
+
+
+def save(
+    folder: Path, config_path: Path, config: BoothConfig, *, with_scans: bool
+) -> tuple[Path, int]:
+    """Write a new backup into `folder`; it appears under its name when it is whole.
+
+    Returns:
+        the backup, and how many files it holds.
+    """
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    final = folder.resolve() / f"booth-{stamp}"
+    temporary = private_folder(folder.resolve() / f".booth-{stamp}.tmp")
+    try:
+        names = []
+        for one in parts(config_path, config):
+            if with_scans or not one.personal:
+                _copy(one.place, temporary / CONTENT / one.name)
+                names.append(one.name)
+        sums = {str(path.relative_to(temporary)): sha256(path) for path in _files(temporary)}
+        manifest = {"format": FORMAT, "version": VERSION, "created": stamp, "parts": names}
+        write_json(temporary / MANIFEST, manifest | {"with_scans": with_scans, "sha256": sums})
+        publish_folder(temporary, final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return final, len(sums)
+
+
+def check(backup: Path) -> list[str]:
+    """Read a whole backup and compare it with its manifest.
+
+    Returns:
+        the names of its parts.
+
+    Raises:
+        FormatError: it is no backup, of an unknown version, or a file is missing, extra or changed.
+    """
+    manifest = read_json(backup / MANIFEST, format=FORMAT, versions=(VERSION,))
+    expected: dict[str, str] = manifest["sha256"]
+    found = {str(path.relative_to(backup)) for path in _files(backup)} - {MANIFEST}
+    for name in sorted(expected.keys() - found):
+        raise FormatError(f"{backup} lacks {name}; use another backup")
+    for name in sorted(found - expected.keys()):
+        raise FormatError(f"{backup} holds {name}, which its manifest does not name")
+    for name, digest in expected.items():
+        if sha256(backup / name) != digest:
+            raise FormatError(f"{backup / name} has changed since it was saved; use another backup")
+    return [str(name) for name in manifest["parts"]]
+
+
+def bring_back(backup: Path, one: Part) -> None:
+    """Put a part where it belongs, whole or not at all; what was there is kept beside it."""
+    fresh = one.place.with_name(f".{one.place.name}.restored")
+    _remove(fresh)
+    _copy(backup / CONTENT / one.name, fresh)
+    if one.place.exists():
+        old = one.place.with_name(f".{one.place.name}.before-restore")
+        _remove(old)
+        one.place.rename(old)
+    fresh.rename(one.place)
+    fsync_folder(one.place.parent)
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal digest of a file's content."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if path.is_file())
+
+
+def _copy(source: Path, target: Path) -> None:
+    for path in (source, *source.rglob("*")):
+        if path.is_symlink():
+            raise BoothError(f"{path} is a symbolic link; a backup holds plain files")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_dir():
+        shutil.copytree(source, target, dirs_exist_ok=True)
+    else:
+        shutil.copy2(source, target)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,38 @@
+"""`station backup`: everything that makes this booth, saved into a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from station.administration import units
+from station.administration.archive import check, save
+from station.core.config import find_config, load_config
+from station.core.errors import BoothError
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option("--with-scans", is_flag=True, help="also scans and results (personal data)")
+def backup(folder: Path, config_path: Path | None, with_scans: bool) -> None:
+    """Save configuration, calibrations and what the booth has learned into FOLDER.
+
+    Each backup is a folder of its own with the time in its name, readable by you alone. It is read
+    again and compared before the command ends. The booth may run meanwhile, but not with
+    --with-scans.
+
+    \b
+    Examples:
+      station backup /media/usb
+      station backup /media/usb --with-scans
+    """
+    path = find_config(config_path).resolve()
+    if with_scans and units.running():
+        raise BoothError("scans move while the booth runs; first: systemctl stop booth.target")
+    saved, count = save(folder, path, load_config(path), with_scans=with_scans)
+    check(saved)
+    click.echo(f"{saved}: {count} files, read again and whole")
+    if not with_scans:
+        click.echo("scans and results are not in it (--with-scans)")

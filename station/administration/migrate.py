@@ -1,0 +1,67 @@
+"""`station migrate`: bring the state folder to this version's layout, or refuse what is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import click
+
+from station.core.errors import FormatError
+from station.core.files import private_folder, read_json, write_json
+
+STATE = "state.json"
+FORMAT = "booth-state"
+VERSION = 1
+"""Raise it with the layout; deploy/package/body-booth/preinst names the versions that it reads."""
+
+Migrations = Mapping[int, Callable[[Path], None]]
+MIGRATIONS: Migrations = {}
+"""Version -> what makes the next version of it; may be repeated after a crash."""
+
+
+def migrate(folder: Path, migrations: Migrations = MIGRATIONS, version: int = VERSION) -> int:
+    """Bring a state folder to `version`, one step at a time; returns the version found.
+
+    A folder without state.json is new, or as old as the first version: both are version 1.
+
+    Raises:
+        FormatError: the folder is of a version that cannot be brought to this one.
+    """
+    path = folder / STATE
+    found = 1
+    if path.exists():
+        known = {*migrations, version}
+        found = int(read_json(path, format=FORMAT, versions=known)["version"])
+    for step in range(found, version):
+        if step not in migrations:
+            raise FormatError(
+                f"{folder} has layout version {step}, which this program cannot bring to version "
+                f"{version}; install the package of a version between them first"
+            )
+        migrations[step](folder)
+        write_json(path, {"format": FORMAT, "version": step + 1})
+    if not path.exists():
+        write_json(private_folder(folder) / STATE, {"format": FORMAT, "version": version})
+    return found
+
+
+@click.command()
+@click.option(
+    "--state",
+    "folder",
+    type=click.Path(path_type=Path),
+    default="/var/lib/booth",
+    show_default=True,
+    help="the state folder",
+)
+def migrate_command(folder: Path) -> None:
+    """Bring the state folder to this version's layout; the package does it on every upgrade.
+
+    \b
+    Examples:
+      station migrate
+    """
+    found = migrate(folder)
+    if found != VERSION:
+        click.echo(f"{folder}: layout version {found} is now version {VERSION}")

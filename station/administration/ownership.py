@@ -1,0 +1,31 @@
+"""Whose files an administrator writes: root's commands leave them to the booth's user."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+USER = "booth"
+
+
+def is_installed_root() -> bool:
+    """Whether root works on a machine that has the booth's user."""
+    if os.geteuid() != 0:
+        return False
+    try:
+        pwd.getpwnam(USER)
+    except KeyError:
+        return False
+    return True
+
+
+def give_to_booth(paths: Iterable[Path]) -> None:
+    """Make files and folders, with all that is in them, the booth's own; only root may."""
+    if not is_installed_root():
+        return
+    for path in paths:
+        for place in (path, *(path.rglob("*") if path.is_dir() else ())):
+            shutil.chown(place, USER, USER)

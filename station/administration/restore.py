@@ -1,0 +1,62 @@
+"""`station restore`: a backup brought back."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import click
+
+from station.administration import units
+from station.administration.archive import CONTENT, Part, bring_back, check, part
+from station.administration.booth_file import CONFIG, STATE_FOLDER
+from station.administration.migrate import migrate
+from station.administration.ownership import USER, give_to_booth, is_installed_root
+from station.core.config import find_config, load_config
+from station.core.errors import BoothError, ConfigError
+
+
+@click.command()
+@click.argument("backup", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+def restore(backup: Path, config_path: Path | None) -> None:
+    """Bring back what `station backup` saved in BACKUP; the booth must be stopped.
+
+    The whole backup is checked before anything is touched. What it replaces stays beside it under
+    a name that ends in .before-restore.
+
+    \b
+    Examples:
+      systemctl stop booth.target
+      station restore /media/usb/booth-20261122T073000Z
+      station setup
+    """
+    path = find_config(config_path).resolve()
+    if units.running():
+        raise BoothError("the booth runs; first: systemctl stop booth.target")
+    if path == CONFIG and not is_installed_root():
+        raise ConfigError(f"{path} belongs to root: sudo station restore, or name another --config")
+    backup = backup.resolve()
+    names = check(backup)
+    saved = load_config(backup / CONTENT / "booth.toml")
+    for name in names:
+        part(name, path, saved)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    bring_back(backup, Part("booth.toml", path))
+    config = load_config(path)
+    others = [part(name, path, config) for name in names if name != "booth.toml"]
+    for one in others:
+        bring_back(backup, one)
+    give_to_booth([one.place for one in others if not one.name.startswith("etc/")])
+    if path == CONFIG:
+        _protect(path.parent)
+        migrate(STATE_FOLDER)
+    click.echo(f"{backup.name} is back: {', '.join(names)}")
+    click.echo("next: station setup" if path == CONFIG else "next: station run")
+
+
+def _protect(folder: Path) -> None:
+    """The services read the configuration and do not write it."""
+    for place in folder.iterdir():
+        shutil.chown(place, "root", USER)
+        place.chmod(0o640)

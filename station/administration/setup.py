@@ -1,0 +1,208 @@
+"""`station setup`: from connected cameras to a booth that runs."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from station.administration import units
+from station.administration.booth_file import (
+    CONFIG,
+    STATE_FOLDER,
+    booth_toml,
+    name_cameras,
+    recorded_cameras,
+)
+from station.administration.connected import (
+    connected_cameras,
+    crowded_controllers,
+    serial_numbers,
+)
+from station.administration.ownership import USER, give_to_booth, is_installed_root
+from station.core.config import BoothConfig, find_config, load_config
+from station.core.drivers import CameraConfig
+from station.core.errors import BoothError, ConfigError, DriverError
+from station.core.files import write_bytes
+from station.sensors.freenect import FreenectCamera
+
+_ANSWER_S = 30.0
+"""Control answers a second after its start; cold disks and four more processes take longer."""
+_COMMAND = "/usr/bin/station"
+_BODY = Path(__file__).parents[1] / "simulation/bodies/ann.npz"
+_UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
+"""Folders that the services do not see."""
+
+
+@click.command()
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@click.option("--camera", "pairs", multiple=True, metavar="NAME=SERIAL", help="name a sensor")
+@click.option(
+    "--recordings",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="replay the recordings in this folder instead of sensors",
+)
+@click.option("--virtual", is_flag=True, help="render a virtual booth with a person and replay it")
+@click.option(
+    "--replace", is_flag=True, help="write booth.toml anew; the old one is kept beside it"
+)
+@click.option("--start/--no-start", default=True, help="enable and start the booth's services")
+def setup(
+    config_path: Path | None,
+    pairs: tuple[str, ...],
+    recordings: Path | None,
+    virtual: bool,
+    replace: bool,
+    start: bool,
+) -> None:
+    """Find the cameras, write booth.toml, start the booth, and say what is left to do.
+
+    A second call changes nothing that is already there: a booth.toml that exists is kept.
+
+    \b
+    Examples:
+      station setup
+      station setup --camera front-upper=A00366902406041A --replace
+      station setup --virtual
+    """
+    path = find_config(config_path).resolve()
+    installed = path == CONFIG
+    if installed and not is_installed_root():
+        raise ConfigError(f"{path} belongs to root: sudo station setup, or name another --config")
+    changed = replace or not path.exists()
+    if changed:
+        if virtual:
+            recordings = _render(STATE_FOLDER if installed else path.parent)
+        cameras = _find(pairs, recordings, installed=installed)
+        _write(path, cameras, installed=installed)
+    elif virtual or recordings or pairs:
+        raise ConfigError(
+            f"{path} exists; --replace writes it anew and keeps the old one beside it"
+        )
+    config = load_config(path)
+    click.echo(f"{path}: {len(config.cameras)} cameras" + ("" if changed else ", kept"))
+    for camera in config.cameras:
+        click.echo(f"  {camera.name:<16} {_source(camera)}")
+    if recordings is not None and changed:
+        _take_calibration(recordings, config)
+    if start and installed and units.installed():
+        units.start(afresh=changed)
+        _wait_for_control()
+        click.echo("the booth runs, and starts with the machine")
+        subprocess.run([_COMMAND, "start"], check=False)
+    _say_what_is_left(config, installed=installed, started=start and installed)
+
+
+def _find(
+    pairs: Sequence[str], recordings: Path | None, *, installed: bool
+) -> list[FreenectCamera]:
+    if recordings is not None:
+        folder = recordings.resolve()
+        if installed and str(folder).startswith(_UNREADABLE):
+            raise ConfigError(
+                f"{folder} is out of the services' sight; copy it to {STATE_FOLDER}/recordings"
+            )
+        return recorded_cameras(folder)
+    serials = serial_numbers()
+    seen = connected_cameras()
+    if not serials:
+        if seen:
+            raise DriverError(
+                f"{len(seen)} Kinects are connected but cannot be opened; unplug them and plug "
+                "them in again, so that the new permissions hold"
+            )
+        raise DriverError(
+            "no Kinect is connected: check USB and the sensors' own power supplies, or try the "
+            "booth without any: station setup --virtual"
+        )
+    return name_cameras(serials, pairs)
+
+
+def _write(path: Path, cameras: Sequence[FreenectCamera], *, installed: bool) -> None:
+    if path.exists():
+        shutil.copy2(path, path.with_name(f"{path.name}.old"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, booth_toml(cameras, installed=installed).encode())
+    if is_installed_root() and installed:
+        # The services read it and do not write it.
+        shutil.chown(path, "root", USER)
+        path.chmod(0o640)
+
+
+def _render(folder: Path) -> Path:
+    """Record a virtual booth, as its user; needs the simulation's libraries."""
+    out = folder / "virtual"
+    if (out / "calibration.json").exists():
+        return out
+    click.echo("rendering what four Kinects see of a virtual person ...")
+    options = ("--body", str(_BODY), "--out", str(out), "--frames", "12", "--passes", "150")
+    user = {"user": USER, "group": USER} if is_installed_root() else {}
+    done = subprocess.run(
+        [sys.executable, "-m", "station.cli", "record-virtual", *options],
+        stdout=subprocess.DEVNULL,
+        cwd="/",
+        check=False,
+        **user,  # type: ignore[call-overload]
+    )
+    if done.returncode:
+        raise BoothError(f"the virtual booth was not rendered; {folder} holds no recordings")
+    return out
+
+
+def _take_calibration(recordings: Path, config: BoothConfig) -> None:
+    """Recordings of a virtual booth bring its calibration along."""
+    source = recordings / "calibration.json"
+    if source.exists() and not config.calibration.exists():
+        write_bytes(config.calibration, source.read_bytes())
+        give_to_booth([config.calibration])
+        click.echo(f"{config.calibration}: taken from {recordings}")
+
+
+def _wait_for_control() -> None:
+    """Until control answers; the command runs as the booth's user, whose sockets they are."""
+    deadline_s = time.monotonic() + _ANSWER_S
+    while True:
+        done = subprocess.run([_COMMAND, "status"], capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return
+        if time.monotonic() > deadline_s:
+            cause = done.stderr.strip().removeprefix("error: ")
+            raise BoothError(
+                f"the booth does not answer ({cause}); journalctl -u 'booth-*' tells why"
+            )
+        time.sleep(0.2)
+
+
+def _source(camera: CameraConfig) -> str:
+    if isinstance(camera, FreenectCamera):
+        return camera.serial or str(camera.recording)
+    return camera.driver
+
+
+def _say_what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> None:
+    left = []
+    physical = [c.serial for c in config.cameras if isinstance(c, FreenectCamera) and c.serial]
+    if physical:
+        missing = sorted(set(physical) - set(serial_numbers()))
+        if missing:
+            left.append(f"connect the sensors {', '.join(missing)}")
+        for controller, count in crowded_controllers(connected_cameras()).items():
+            left.append(
+                f"{count} sensors hang on one USB controller ({controller}): give each its own"
+            )
+        left.append(
+            "cover one lens after the other and see in `station status` that the right camera goes "
+            "silent; else station setup --replace --camera NAME=SERIAL"
+        )
+    if not config.calibration.exists():
+        left.append("station calibrate")
+    if not started:
+        left.append("systemctl enable --now booth.target" if installed else "station run")
+    click.echo("left to do:" if left else 'ready: station scan --label "Order 1234"')
+    for number, words in enumerate(left, 1):
+        click.echo(f"  {number}. {words}")

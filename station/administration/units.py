@@ -1,0 +1,47 @@
+"""The booth's systemd units: whether there are any, and starting them."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+from station.core.errors import BoothError
+
+TARGET = "booth.target"
+_PLACE = Path("/usr/lib/systemd/system") / TARGET
+
+
+def installed() -> bool:
+    """Whether systemd runs this machine and the package has given it the booth's units."""
+    return Path("/run/systemd/system").is_dir() and _PLACE.exists()
+
+
+def running() -> bool:
+    """Whether the booth's target is up."""
+    return installed() and _systemctl("--quiet", "is-active", TARGET).returncode == 0
+
+
+def start(*, afresh: bool) -> None:
+    """Enable the target for every boot and start it.
+
+    Args:
+        afresh: whether booth.toml has changed, so that what runs must be started anew.
+
+    Raises:
+        BoothError: systemd's own words.
+    """
+    _must("daemon-reload")
+    _must("--quiet", "enable", TARGET)
+    if afresh:
+        _must("stop", TARGET)
+    _must("start", TARGET)
+
+
+def _must(*words: str) -> None:
+    done = _systemctl(*words)
+    if done.returncode:
+        raise BoothError(f"systemctl {' '.join(words)}: {done.stderr.strip()}")
+
+
+def _systemctl(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["systemctl", *words], capture_output=True, text=True, check=False)

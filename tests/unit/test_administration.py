@@ -1,0 +1,219 @@
+"""Setting up, saving, restoring and migrating a booth, on real folders."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from station.administration.archive import parts, save
+from station.administration.booth_file import booth_toml, name_cameras
+from station.administration.connected import connected_cameras, crowded_controllers
+from station.administration.migrate import migrate
+from station.administration.restore import restore
+from station.administration.setup import setup
+from station.core.config import load_config
+from station.core.errors import BoothError, ConfigError, FormatError
+
+
+def _recordings(folder: Path) -> Path:
+    for name in ("front-lower", "back-upper"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "INDEX.txt").write_text("")
+    (folder / "calibration.json").write_text("{}")
+    return folder
+
+
+def _run(command: object, *words: object) -> str:
+    result = CliRunner().invoke(command, list(map(str, words)))  # type: ignore[arg-type]
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_setup_writes_a_booth_and_keeps_it(tmp_path: Path) -> None:
+    """A second call must not undo what the technician has changed since."""
+    config = tmp_path / "booth/booth.toml"
+    recordings = _recordings(tmp_path / "recordings")
+    words = _run(setup, "--config", config, "--recordings", recordings)
+    booth = load_config(config)
+    assert [camera.name for camera in booth.cameras] == ["back-upper", "front-lower"]
+    assert booth.calibration.read_text() == "{}"
+    assert "station run" in words
+    config.write_text(config.read_text() + "[workers]\ncount = 3\n")
+    before = config.read_bytes()
+    assert "kept" in _run(setup, "--config", config)
+    assert config.read_bytes() == before
+    with pytest.raises(ConfigError, match="--replace"):
+        _run(setup, "--config", config, "--recordings", recordings)
+    _run(setup, "--config", config, "--recordings", recordings, "--replace")
+    assert load_config(config).workers.count == 1
+    assert config.with_name("booth.toml.old").read_bytes() == before
+
+
+def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no recordings"):
+        _run(setup, "--config", tmp_path / "booth.toml", "--recordings", tmp_path)
+    assert not (tmp_path / "booth.toml").exists()
+
+
+def test_sensors_get_the_names_that_were_given(tmp_path: Path) -> None:
+    cameras = name_cameras(["A", "B", "C", "D", "E"], ["back-lower=B"])
+    assert [(camera.serial, camera.name) for camera in cameras] == [
+        ("A", "front-lower"),
+        ("B", "back-lower"),
+        ("C", "front-upper"),
+        ("D", "back-upper"),
+        ("E", "camera-5"),
+    ]
+    path = tmp_path / "booth.toml"
+    path.write_text(booth_toml(cameras, installed=False))
+    assert load_config(path).cameras == tuple(cameras)
+    with pytest.raises(ConfigError, match="connected sensors: A"):
+        name_cameras(["A"], ["front=Z"])
+
+
+def test_two_kinects_on_one_controller_are_named(tmp_path: Path) -> None:
+    """Each takes most of what USB 2 carries, whatever the number of ports."""
+    devices = tmp_path / "devices"
+    devices.mkdir()
+    for number, (product, controller) in enumerate(
+        [("02ae", "0000:00:14.0"), ("02bf", "0000:00:14.0"), ("02ae", "0000:05:00.0")]
+    ):
+        place = tmp_path / f"pci0000:00/{controller}/usb{number + 1}/{number + 1}-1"
+        place.mkdir(parents=True)
+        (place / "idVendor").write_text("045e\n")
+        (place / "idProduct").write_text(f"{product}\n")
+        (devices / place.name).symlink_to(place)
+    cameras = connected_cameras(devices)
+    assert [camera.model for camera in cameras] == [
+        "Kinect for Xbox",
+        "Kinect for Windows",
+        "Kinect for Xbox",
+    ]
+    assert crowded_controllers(cameras) == {"0000:00:14.0": 2}
+
+
+@pytest.fixture
+def booth(tmp_path: Path) -> Path:
+    """A booth with a calibration, a record of its own, and one delivered scan."""
+    folder = tmp_path / "booth"
+    _run(setup, "--config", folder / "booth.toml", "--recordings", _recordings(tmp_path / "r"))
+    for name in ("calibrations/20261122/ball.npz", "spool/outbox/scan-1/mesh.ply", "spool/tmp/x"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(name.encode())
+    (folder / "spool/audit.jsonl").write_text("{}\n")
+    return folder / "booth.toml"
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.parts)
+    }
+
+
+@pytest.mark.parametrize("with_scans", [False, True])
+def test_what_was_saved_comes_back_on_another_machine(
+    booth: Path, tmp_path: Path, with_scans: bool
+) -> None:
+    saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=with_scans)
+    expected = _content(booth.parent)
+    del expected["spool/tmp/x"]
+    if not with_scans:
+        del expected["spool/outbox/scan-1/mesh.ply"]
+    other = tmp_path / "other/booth.toml"
+    _run(restore, saved, "--config", other)
+    assert _content(other.parent) == expected
+
+
+def test_restoring_keeps_what_it_replaces(booth: Path, tmp_path: Path) -> None:
+    saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
+    calibration = load_config(booth).calibration
+    calibration.write_text('{"newer": true}')
+    _run(restore, saved, "--config", booth)
+    assert calibration.read_text() == "{}"
+    old = calibration.with_name(".calibration.json.before-restore")
+    assert old.read_text() == '{"newer": true}'
+
+
+@pytest.mark.parametrize("fault", ["changed", "missing", "extra", "version", "name"])
+def test_a_damaged_backup_changes_nothing(booth: Path, tmp_path: Path, fault: str) -> None:
+    saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
+    manifest = json.loads((saved / "backup.json").read_text())
+    if fault == "changed":
+        (saved / "content/calibration.json").write_text("{ }")
+    elif fault == "missing":
+        (saved / "content/calibration.json").unlink()
+    elif fault == "extra":
+        (saved / "content/more").write_text("")
+    elif fault == "version":
+        manifest["version"] = 2
+    else:
+        manifest["parts"].append("etc/../../passwd")
+    (saved / "backup.json").write_text(json.dumps(manifest))
+    before = _content(booth.parent)
+    with pytest.raises(FormatError):
+        _run(restore, saved, "--config", booth)
+    assert _content(booth.parent) == before
+
+
+def test_a_backup_appears_whole_or_not_at_all(booth: Path, tmp_path: Path) -> None:
+    (booth.parent / "calibrations/link").symlink_to("/etc/passwd")
+    with pytest.raises(BoothError, match="symbolic link"):
+        save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
+    assert list((tmp_path / "usb").iterdir()) == []
+
+
+def test_every_file_of_a_booth_belongs_to_a_part(booth: Path) -> None:
+    """What a later version adds to the spool must not be forgotten by a backup."""
+    names = {part.name for part in parts(booth, load_config(booth))}
+    assert names == {
+        "booth.toml",
+        "calibration.json",
+        "calibrations",
+        "spool/outbox",
+        "spool/audit.jsonl",
+    }
+
+
+def test_a_new_state_folder_gets_this_version(tmp_path: Path) -> None:
+    assert migrate(tmp_path / "state") == 1
+    assert json.loads((tmp_path / "state/state.json").read_text())["version"] == 1
+
+
+def test_migrations_run_one_by_one_and_go_on_after_a_crash(tmp_path: Path) -> None:
+    done: list[int] = []
+
+    def crash(folder: Path) -> None:
+        raise RuntimeError(folder)
+
+    migrate(tmp_path)
+    with pytest.raises(RuntimeError):
+        migrate(tmp_path, {1: lambda _: done.append(1), 2: crash}, 3)
+    migrate(tmp_path, {1: lambda _: done.append(1), 2: lambda _: done.append(2)}, 3)
+    assert done == [1, 2]
+    assert json.loads((tmp_path / "state.json").read_text())["version"] == 3
+
+
+@pytest.mark.parametrize("version", [0, 2, "1"])
+def test_a_layout_that_is_not_known_is_refused(tmp_path: Path, version: object) -> None:
+    path = tmp_path / "state.json"
+    path.write_text(json.dumps({"format": "booth-state", "version": version}))
+    before = path.read_bytes()
+    with pytest.raises(FormatError, match="version"):
+        migrate(tmp_path)
+    assert path.read_bytes() == before
+
+
+def test_the_package_refuses_what_its_migrations_do_not_read() -> None:
+    """preinst is a shell script that runs before the package's own code is there."""
+    from station.administration.migrate import MIGRATIONS, VERSION
+
+    script = Path(__file__).parents[2] / "deploy/package/body-booth/preinst"
+    known = " ".join(map(str, sorted({*MIGRATIONS, VERSION})))
+    assert f'known_state="{known}"' in script.read_text()
