@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+from numpy.typing import NDArray
 
 from workers.scape.model.body_model import BodyModel, BodyState, load_model
 from workers.scape.model.deformation import triangle_areas, vertex_normals
@@ -84,6 +85,11 @@ def test_asking_for_some_triangles_finds_all_their_pairs(model: BodyModel) -> No
     assert {tuple(pair) for pair in crossing_pairs(body, model.faces, asking).tolist()} == wanted
 
 
+def _nothing(model: BodyModel) -> NDArray[np.bool_]:
+    """No vertex is measured."""
+    return np.zeros(model.vertex_count, bool)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_rough_surface_is_set_free(model: BodyModel, seed: int) -> None:
     """Lips, ears, toes and fingers crossed in every fit: a slicer and a cloth simulation choke."""
@@ -91,7 +97,7 @@ def test_a_rough_surface_is_set_free(model: BodyModel, seed: int) -> None:
     rough = _roughened(model, reference, seed)
     assert self_intersections(rough, model.faces) > 100
     assert turned_over(rough, reference, model.faces).any()
-    free = untangled(model, rough, reference)
+    free = untangled(model, rough, reference, _nothing(model))
     assert self_intersections(free, model.faces) == 0
     assert not turned_over(free, reference, model.faces).any()
     assert (triangle_areas(free, model.faces) > 0.0).all()
@@ -109,7 +115,7 @@ def test_an_arm_laid_on_the_trunk_parts_from_it(model: BodyModel) -> None:
     arm = model.part_of_vertex == model.part_names.index("upper_arm_left")
     crossing = crossing_pairs(body, model.faces)
     assert arm[model.faces[crossing[:, 0]]].any() or arm[model.faces[crossing[:, 1]]].any()
-    free = untangled(model, body, body)
+    free = untangled(model, body, body, _nothing(model))
     assert self_intersections(free, model.faces) == 0
     assert np.linalg.norm(free - body, axis=1).max() < 0.025
 
@@ -121,7 +127,7 @@ def test_what_cannot_part_is_not_spoiled(model: BodyModel) -> None:
     state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
     reference = model.vertices(state)
     rough = _roughened(model, reference, 1)
-    free = untangled(model, rough, reference)
+    free = untangled(model, rough, reference, _nothing(model))
     left = crossing_pairs(free, model.faces)
     names = np.array(model.part_names)[model.part_of_vertex[model.faces[left].ravel()]]
     assert len(left) > 0
@@ -130,6 +136,31 @@ def test_what_cannot_part_is_not_spoiled(model: BodyModel) -> None:
 
 
 def test_a_good_surface_stays_as_it_is(model: BodyModel) -> None:
-    free = untangled(model, model.mean, model.mean)
-    again = untangled(model, free, model.mean)
+    free = untangled(model, model.mean, model.mean, _nothing(model))
+    again = untangled(model, free, model.mean, _nothing(model))
     assert np.array_equal(again, free)
+
+
+def test_measured_skin_stays_while_the_rest_can_give_way(model: BodyModel) -> None:
+    """An arm 4 mm inside the trunk, whose outer side was measured: its inner side yields."""
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("upper_arm_left"), 1] = np.radians(28.0)
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    body = model.vertices(state)
+    crossing = np.unique(model.faces[crossing_pairs(body, model.faces)])
+    measured = _nothing(model)
+    measured[~_near(model, crossing, rings=2)] = True
+    free = untangled(model, body, body, measured)
+    assert self_intersections(free, model.faces) == 0
+    left = np.linalg.norm(free - body, axis=1)[measured] > 1e-6
+    held_not = untangled(model, body, body, _nothing(model))
+    before = np.linalg.norm(held_not - body, axis=1)[measured] > 1e-6
+    assert np.count_nonzero(left) < 0.2 * np.count_nonzero(before)
+
+
+def _near(model: BodyModel, vertices: NDArray[np.int32], rings: int) -> NDArray[np.bool_]:
+    near = _nothing(model)
+    near[vertices] = True
+    for _ in range(rings):
+        near |= model.adjacency @ near > 0
+    return near

@@ -33,10 +33,12 @@ from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
 from workers.scape.fit.sampling import Sampling
+from workers.scape.fit.unmatched import unmatched_patches
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
     judge,
+    lost_parts,
     report_parts,
     sides_seen,
     unexplained_share,
@@ -209,13 +211,14 @@ def separate_limbs(
     start = time.monotonic()
     surface, vertices = fit.surface, fit.surface.vertices
     if fit.reference is not None:
-        vertices = untangled(model, vertices, fit.reference)
+        vertices = untangled(model, vertices, fit.reference, surface.measured)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
-    parts, rms_m, unexplained = report_parts(model, vertices, surface.seen, fit.cloud)
+    parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
+    lost = lost_parts(model, unmatched_patches(model, vertices, fit.cloud))
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, findings, unexplained, stature_m, beta, shifts)
+    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

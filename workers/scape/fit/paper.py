@@ -65,7 +65,15 @@ def fit_like_the_paper(
     residual[vertex] = np.einsum(
         "ni,ni->n", normals[vertex], target.tree.points[point] - mesh[vertex]
     )
-    return SurfaceFit(mesh, model.vertex_sigma_m.copy(), seen, residual), state, iteration
+    surface = SurfaceFit(
+        vertices=mesh,
+        sigma_m=model.vertex_sigma_m.copy(),
+        seen=seen,
+        residual_m=residual,
+        measured=seen,
+        mismatch_m=float(np.sqrt(np.nanmean(residual**2))),
+    )
+    return surface, state, iteration
 
 
 def find_pairs(model: BodyModel, target: Target, mesh: Array) -> Pairs:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
+from workers.scape.fit.unmatched import Patch
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
 
@@ -19,19 +20,19 @@ _LEAST_COVERAGE = 0.22
 """Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
 _LEAST_EXTREMITY_COVERAGE = 0.10
 """The same for hands, feet, shoulders and the neck, which hide behind other parts."""
-_MOST_PART_RESIDUAL_M = 0.012
-"""Largest rms distance of a part's points to the surface: ten times that of a sound fit."""
+_LOST_PATCH_M2 = 0.0040
+"""Least area of a patch of the scan farther than 15 mm from the surface that makes a scan unusable:
+lost limbs leave 66 to 205 cm^2, folds and hair of sound scans of real people up to 11 cm^2."""
+_ELSEWHERE_M = 0.15
+"""Distance of a patch from which it is no limb of the person but something else."""
+_PARTS_NAMED = 6
+"""Parts that the reasons name at most."""
 _UNEXPLAINED_M = 0.03
 """Distance from the surface beyond which a point does not belong to the body."""
-_MOST_UNEXPLAINED = 0.015
-"""Largest share of such points in the whole scan."""
-_MOST_UNEXPLAINED_OF_PART = 0.15
-"""Largest share of such points among those nearest to one part: a lost limb has more."""
-_STRAY_SHARE = 0.001
-"""Share of the scan's points up to which unexplained points near a part are noise."""
-_MOST_CAMERA_SHIFT_M = 0.002
-"""Largest correction of a camera: well-placed cameras are moved by tenths of a millimetre, one that
-is 5 mm off its calibration by 3 mm or more."""
+_CAMERA_SHIFTS_M = (0.002, 0.004)
+"""Corrections of a camera from which it is remarked, and from which the scan cannot be used.
+Well-placed cameras are moved by tenths of a millimetre, one that is 5 mm off its calibration by
+3 mm or more; the fit still corrects that."""
 _STATURES_M = (1.30, 2.25)
 """Statures of adults, metres."""
 _MOST_BETA = 6.0
@@ -56,8 +57,6 @@ class PartReport:
     """Share of the part's area that cameras saw."""
     residual_rms_m: float
     """Rms distance of the part's points to the surface; NaN where it has none."""
-    unexplained: float
-    """Share of the points nearest to the part that lie farther than 3 cm from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +66,14 @@ class Verdict:
     status: str
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    """Remarks on the booth that do not touch this scan."""
 
 
 def report_parts(
     model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: PointCloud
-) -> tuple[tuple[PartReport, ...], float, float]:
-    """Reports on all parts, the point-to-surface rms in metres, the share of unexplained points.
+) -> tuple[tuple[PartReport, ...], float]:
+    """Reports on all parts, and the point-to-surface rms in metres.
 
     Args:
         vertices: (P, 3), the fitted surface.
@@ -94,10 +95,9 @@ def report_parts(
         own = np.isin(part[vertex], members) & ~unexplained
         rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
         coverage = float(areas[mine & seen].sum() / areas[mine].sum())
-        around = np.isin(part[vertex], members)
-        reports.append(PartReport(name, coverage, rms, _unexplained_of(around, unexplained)))
+        reports.append(PartReport(name, coverage, rms))
     rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
-    return tuple(reports), rms, float(unexplained.mean())
+    return tuple(reports), rms
 
 
 def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
@@ -113,14 +113,6 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
         there = trunk & (sign * toward > _FACING)
         shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
     return shares
-
-
-def _unexplained_of(around: NDArray[np.bool_], unexplained: NDArray[np.bool_]) -> float:
-    """Share of unexplained points around a part, 0 where they are so few that they are noise."""
-    lost = int(np.count_nonzero(around & unexplained))
-    if lost < _STRAY_SHARE * len(around):
-        return 0.0
-    return lost / int(np.count_nonzero(around))
 
 
 def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> float:
@@ -151,7 +143,7 @@ def judge(
     parts: Sequence[PartReport],
     sides: dict[str, float],
     findings: Sequence[Finding],
-    unexplained: float,
+    lost: Sequence[str],
     stature_m: float,
     beta: Array,
     camera_shifts_m: dict[str, float],
@@ -161,16 +153,12 @@ def judge(
     Args:
         sides: shares of the trunk's front and back that were seen.
         findings: what preprocessing noticed; each is a reason.
-        unexplained: share of the points that do not belong to the body.
+        lost: what `lost_parts` says.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
     """
     reasons = [finding.message for finding in findings]
-    if unexplained > _MOST_UNEXPLAINED:
-        reasons.append(
-            f"{100 * unexplained:.1f} % of what the cameras saw does not belong to the measured "
-            "body: an arm or a leg is wrong, or something else is in the booth"
-        )
+    reasons += lost
     low, high = _STATURES_M
     if not low < stature_m < high:
         reasons.append(
@@ -184,25 +172,47 @@ def judge(
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
     for part in parts:
         reasons += _part_reasons(part)
+    noticed, unusable = _CAMERA_SHIFTS_M
+    notes: list[str] = []
     for camera, shift in camera_shifts_m.items():
-        if shift > _MOST_CAMERA_SHIFT_M:
-            reasons.append(
+        if shift > noticed:
+            (reasons if shift > unusable else notes).append(
                 f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
                 "run: station check"
             )
-    return Verdict("rescan" if reasons else "ok", tuple(reasons))
+    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes))
+
+
+def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> list[str]:
+    """Reasons, in words, for each part of the body that a large patch of the scan belongs to."""
+    keys = {index: key for key, members in _groups(model).items() for index in members}
+    reasons: dict[str, str] = {}
+    for patch in patches:
+        if patch.area_m2 < _LOST_PATCH_M2:
+            continue
+        size = f"{1e4 * patch.area_m2:.0f} cm2"
+        if patch.distance_m > _ELSEWHERE_M:
+            reasons.setdefault(
+                "",
+                f"{size} of the scan do not belong to the person: "
+                "take other things out of the booth",
+            )
+            continue
+        for index in patch.parts:
+            words = part_in_words(keys[index])
+            reasons.setdefault(
+                words,
+                f"the {words} does not match the scan ({size} of it lie "
+                f"{1e3 * patch.distance_m:.0f} mm away)",
+            )
+    return list(reasons.values())[:_PARTS_NAMED]
 
 
 def _part_reasons(part: PartReport) -> list[str]:
-    words = part_in_words(part.name)
     extremity = part.name.startswith(_EXTREMITIES)
     if part.coverage < (_LEAST_EXTREMITY_COVERAGE if extremity else _LEAST_COVERAGE):
+        words = part_in_words(part.name)
         return [f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"]
-    if part.unexplained > _MOST_UNEXPLAINED_OF_PART:
-        share = f"{100 * part.unexplained:.0f} %"
-        return [f"the {words} does not match the scan ({share} of its points lie elsewhere)"]
-    if part.residual_rms_m > _MOST_PART_RESIDUAL_M:
-        return [f"the {words} does not match the scan ({1e3 * part.residual_rms_m:.0f} mm apart)"]
     return []
 
 

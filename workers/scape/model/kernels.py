@@ -234,53 +234,6 @@ def descend(points, nodes, first, neighbours, start, square, product):  # type: 
     return out, within
 
 
-@numba.njit(cache=True)
-def conjugate_gradients(first, columns, values, right, tolerance, most):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(n,): the solution of A x = right, preconditioned by the diagonal (Hestenes & Stiefel 1952).
-
-    scipy's spends most of its time between the products when they take microseconds.
-
-    Args:
-        first, columns, values: A (n, n) in compressed rows, symmetric, positive definite.
-        right: (n,).
-        tolerance: of the residual's length against that of right.
-        most: steps.
-    """
-    count = len(right)
-    inverse = np.empty(count)
-    for row in range(count):
-        for index in range(first[row], first[row + 1]):
-            if columns[index] == row:
-                inverse[row] = 1.0 / values[index]
-    found = np.zeros(count)
-    residual = right.copy()
-    direction = inverse * residual
-    product = np.empty(count)
-    strength = np.sum(residual * direction)
-    enough = tolerance**2 * np.sum(right * right)
-    for _ in range(most):
-        if np.sum(residual * residual) <= enough:
-            break
-        along = 0.0
-        for row in range(count):
-            total = 0.0
-            for index in range(first[row], first[row + 1]):
-                total += values[index] * direction[columns[index]]
-            product[row] = total
-            along += total * direction[row]
-        step = strength / along
-        following = 0.0
-        for row in range(count):
-            found[row] += step * direction[row]
-            residual[row] -= step * product[row]
-            following += residual[row] * residual[row] * inverse[row]
-        share = following / strength
-        strength = following
-        for row in range(count):
-            direction[row] = inverse[row] * residual[row] + share * direction[row]
-    return found
-
-
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def add_places(blocks, rotations, beta, twists, positions):  # type: ignore[no-untyped-def]  # pragma: no cover
     """What `add_blocks` adds to the positions alone."""

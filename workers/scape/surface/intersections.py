@@ -4,6 +4,9 @@ Where the surface leaves the model's too abruptly (lips, ears, between fingers),
 model is smoothed, so that the model's shape is restored there. Where the model itself overlaps (an
 arm on the trunk, thighs), the surface is smoothed instead: both sides of a contact are flattened
 until they separate. Patches grow only as long as they still cross.
+
+Most crossings lie in skin that no camera saw, and so does the error that they show: skin with
+readings on it stays where it is as long as the rest can give way.
 """
 
 from __future__ import annotations
@@ -22,7 +25,12 @@ from workers.scape.surface.crossings import crossing_pairs
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MOST_ROUNDS = 45
+_MOST_ROUNDS = 60
+_HOLDING_ROUNDS = 25
+"""Rounds in which measured skin is held."""
+_YIELDING = 0.3
+"""Share of the way to the neighbours' mean that a held corner of a bad triangle moves in one of
+these rounds."""
 _OFFSET_ROUNDS = 3
 """Rounds in which offsets are smoothed; vertices that still cross after them are flattened."""
 _ROUNDS_PER_RING = 4
@@ -53,7 +61,7 @@ def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
     return np.asarray(turned)
 
 
-def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
+def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mask) -> Array:
     """Surface (P, 3) without crossings and flipped triangles.
 
     Parts that are centimetres inside each other, as on no real body, stay as they are: flattening
@@ -62,6 +70,8 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     Args:
         vertices: (P, 3), the fitted surface.
         reference: (P, 3), the model's surface in the same pose and shape.
+        measured: (P,), vertices of triangles with readings on them. They are moved only where
+            crossings remain otherwise.
     """
     faces = model.faces
     mean = _neighbour_mean(model)
@@ -69,7 +79,10 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
     trouble = np.zeros(len(vertices), np.int64)
     tested: Mask = np.ones(len(faces), bool)
     given_up: Mask = np.zeros(len(faces), bool)
+    held = measured
     for round_ in range(_MOST_ROUNDS):
+        if round_ == _HOLDING_ROUNDS:
+            held, trouble = np.zeros_like(measured), np.zeros_like(trouble)
         bad = _bad(current, reference, faces, tested) & ~given_up
         if round_ == _OFFSET_ROUNDS:
             early = current
@@ -81,10 +94,13 @@ def untangled(model: BodyModel, vertices: Array, reference: Array) -> Array:
         corners[faces[bad]] = True
         marked = _grown(corners, mean, 1)
         trouble += marked
-        patch = np.flatnonzero(_grown(marked, mean, 1 + round_ // _ROUNDS_PER_RING))
-        current = _relaxed(current, reference, patch, trouble[patch] > _OFFSET_ROUNDS, mean)
+        around = _grown(marked, mean, 1 + round_ // _ROUNDS_PER_RING)
+        patch, yielding = np.flatnonzero(around & ~held), np.flatnonzero(corners & held)
+        relaxed = _relaxed(current, reference, patch, trouble[patch] > _OFFSET_ROUNDS, mean)
+        relaxed[yielding] += _YIELDING * (mean[yielding] @ current - current[yielding])
+        current = relaxed
         changed = np.zeros(len(vertices), bool)
-        changed[patch] = True
+        changed[patch] = changed[yielding] = True
         tested = np.asarray(changed[faces].any(axis=1))
     else:
         bad = _bad(current, reference, faces, tested)

@@ -1,0 +1,118 @@
+"""The surface's offsets: where points are attached, what the prior says, what is solved."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.surface.attachment import attached
+from workers.scape.surface.offset_equations import OffsetRows, solved
+from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prior
+from workers.scape.surface.uncertainty import surface_sigma
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+def _grid(side: int, size_m: float) -> tuple[Array, NDArray[np.int32]]:
+    """A flat square of so many vertices a side."""
+    x, y = np.meshgrid(*[np.linspace(0.0, size_m, side)] * 2, indexing="ij")
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], axis=1)
+    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    lower = np.stack([a, a + side, a + side + 1], axis=1)
+    upper = np.stack([a, a + side + 1, a + 1], axis=1)
+    return vertices, np.concatenate([lower, upper]).astype(np.int32)
+
+
+def test_points_are_attached_to_the_nearest_place(model: BodyModel) -> None:
+    rng = np.random.default_rng(3)
+    normals = vertex_normals(model.mean, model.faces)
+    chosen = np.flatnonzero(model.part_of_vertex == model.part_names.index("abdomen"))
+    points = model.mean[chosen] + 0.001 * rng.standard_normal((len(chosen), 3))
+    points += 0.003 * normals[chosen]
+    _, near = cKDTree(model.mean).query(points)
+    places = attached(model, model.mean, points, near).of(model.mean, model.faces)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(model.mean.astype(np.float32)),
+        o3d.core.Tensor(model.faces.astype(np.uint32)),
+    )
+    nearest = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
+    assert np.abs(np.linalg.norm(points - places, axis=1) - nearest).max() < 1e-4
+
+
+def test_the_prior_is_a_field_of_unit_deviation_and_the_stated_range() -> None:
+    """Far from the border the variance is 1 and the Matern correlation at the range 0.14."""
+    vertices, faces = _grid(61, 0.6)
+    prior = OffsetPrior.build(vertices, faces)
+    middle = int(np.argmin(np.linalg.norm(vertices[:, :2] - 0.3, axis=1)))
+    column = spsolve(prior.precision.tocsc(), np.eye(len(vertices))[middle])
+    assert column[middle] == pytest.approx(1.0, abs=0.05)
+    away = int(np.argmin(np.linalg.norm(vertices[:, :2] - (0.3 + RANGE_M, 0.3), axis=1)))
+    assert column[away] / column[middle] == pytest.approx(0.14, abs=0.03)
+
+
+def test_means_around_a_vertex_keep_a_constant() -> None:
+    vertices, faces = _grid(61, 0.6)
+    prior = OffsetPrior.build(vertices, faces)
+    assert np.allclose(prior.share_around(np.ones(len(vertices))), 1.0, atol=1e-9)
+
+
+def test_the_offsets_solve_their_normal_equations(model: BodyModel) -> None:
+    rng = np.random.default_rng(5)
+    chosen = rng.choice(model.vertex_count, 3000, replace=False)
+    normals = vertex_normals(model.mean, model.faces)
+    points = model.mean[chosen] + 0.003 * normals[chosen]
+    places = attached(model, model.mean, points, chosen)
+    weight = rng.uniform(1e5, 1e6, len(points))
+    residual = 0.003 + 0.001 * rng.standard_normal(len(points))
+    rows = OffsetRows(places, normals[chosen], residual, weight)
+    prior, sigma_m = offset_prior(model), 0.004
+    found = solved(model, prior, sigma_m, rows, np.zeros_like(model.mean), 1e-3)
+    corners = model.faces[places.triangle]
+    entries = (places.weights[:, :, None] * rows.direction[:, None, :]).ravel()
+    columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
+    matrix = sp.csr_matrix((entries, (np.repeat(np.arange(len(points)), 9), columns)))
+    matrix.resize(len(points), 3 * model.vertex_count)
+    prior_part = sp.kron(prior.precision / sigma_m**2, sp.identity(3))
+    normal = (prior_part + matrix.T @ sp.diags(weight) @ matrix).tocsr()
+    right = matrix.T @ (weight * residual)
+    scale = 1.0 / np.sqrt(normal.diagonal())
+    left = scale * (normal @ found.ravel() - right)
+    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(scale * right)
+    on_points = np.einsum("ni,ni->n", rows.direction, places.of(found, model.faces))
+    assert on_points.mean() == pytest.approx(0.003, abs=3e-4)
+
+
+def test_skin_is_the_less_known_the_farther_it_is_from_readings(model: BodyModel) -> None:
+    prior = offset_prior(model)
+    seen = model.mean[:, 1] < 0.0
+    rng = np.random.default_rng(7)
+    mismatch = 0.003 * rng.standard_normal(model.vertex_count)
+    information = np.where(seen, 1e8, 0.0)
+    sigma = surface_sigma(prior, seen, information, mismatch, seen)
+    away = prior.distance_m(seen)
+    near, far = sigma[seen].mean(), sigma[away > 0.06].mean()
+    assert 0.0005 < near < 0.5 * far < 0.0025
+    like = surface_sigma(prior, seen, information, 0.4 * mismatch, seen)
+    assert like[seen].mean() < 0.5 * near
+
+
+def test_a_missing_limb_is_known_to_centimetres_alone(model: BodyModel) -> None:
+    prior = offset_prior(model)
+    seen = model.mean[:, 2] > 0.9
+    sigma = surface_sigma(
+        prior, seen, np.where(seen, 1e6, 0.0), np.full(model.vertex_count, 0.001), seen
+    )
+    assert sigma[model.mean[:, 2] < 0.1].min() > 0.015

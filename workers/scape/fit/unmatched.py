@@ -1,0 +1,76 @@
+"""Patches of the scan that the fitted surface does not explain.
+
+A limb that the fit lost leaves a coherent patch of readings centimetres from the surface. Shares of
+points say less: they mix a lost hand with the folds and the stray readings of a sound scan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from workers.cloud.observed import PointCloud
+from workers.scape.model.body_model import BodyModel
+from workers.scape.surface.attachment import attached
+
+Array = NDArray[np.float64]
+
+_CELL_M = 0.02
+"""Points are thinned to one for each cube of this size; cubes that touch are connected."""
+_MOST_CELLS = 4_000_000
+"""A cloud that fills a larger grid (20 x 2 x 2 m) is no body and has no patches."""
+FAR_M = 0.015
+"""Distance from which a point is not explained: the folds of real people stay below it."""
+_SHARE_OF_PATCH = 0.2
+"""A patch is of every part that is nearest to at least so much of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Connected part of the scan that lies farther than 15 mm from the surface."""
+
+    area_m2: float
+    distance_m: float
+    """Median distance to the surface."""
+    parts: tuple[int, ...]
+    """Indices of the model's parts that are nearest to it, the most frequent first."""
+
+
+def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> tuple[Patch, ...]:
+    """Patches of a cloud that a surface (P, 3) does not explain, the largest first."""
+    cells = np.floor((cloud.points - cloud.points.min(axis=0)) / _CELL_M).astype(np.int64) + 1
+    shape = tuple(int(n) for n in cells.max(axis=0) + 2)
+    if np.prod(shape, dtype=np.float64) > _MOST_CELLS:
+        return ()
+    cell, chosen = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_index=True)
+    points = cloud.points[chosen]
+    _, near = cKDTree(vertices).query(points)
+    places = attached(model, vertices, points, near)
+    away = np.linalg.norm(points - places.of(vertices, model.faces), axis=1)
+    far = np.flatnonzero(away > FAR_M)
+    occupied = np.zeros(shape, bool)
+    occupied.flat[cell[far]] = True
+    labels, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
+    label = labels.flat[cell[far]]
+    # A plane of this normal meets so many cells per square metre.
+    area = _CELL_M**2 / np.abs(cloud.normals[chosen[far]]).sum(axis=1)
+    part = model.part_of_vertex[near[far]]
+    patches = [
+        Patch(
+            float(area[label == index].sum()),
+            float(np.median(away[far][label == index])),
+            _parts_of(part[label == index]),
+        )
+        for index in range(1, count + 1)
+    ]
+    return tuple(sorted(patches, key=lambda patch: -patch.area_m2))
+
+
+def _parts_of(part: NDArray[np.int32]) -> tuple[int, ...]:
+    counts = np.bincount(part)
+    order = np.argsort(-counts, kind="stable")
+    return tuple(int(p) for p in order if counts[p] >= _SHARE_OF_PATCH * len(part))
