@@ -118,6 +118,7 @@ def result_document(
         "scan_id": scan_id,
         "status": fit.verdict.status,
         "reasons": list(fit.verdict.reasons),
+        "notes": list(fit.verdict.notes),
         "method": method,
         "model": {"name": model.name, "sha256": model.sha256},
         "shape": fit.state.beta.tolist(),

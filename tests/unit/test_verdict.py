@@ -1,0 +1,91 @@
+"""What makes a scan unusable, and what is only remarked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workers.cloud.observed import PointCloud
+from workers.scape.fit.unmatched import unmatched_patches
+from workers.scape.fit.verdict import judge, lost_parts
+from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.deformation import vertex_normals
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+def _scan_of(model: BodyModel, vertices: Array) -> PointCloud:
+    """Three points on each triangle, as dense as a booth's cloud on the trunk."""
+    normals = vertex_normals(vertices, model.faces)
+    shares = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])
+    points = np.einsum("sc,kci->ski", shares, vertices[model.faces]).reshape(-1, 3)
+    directions = np.einsum("sc,kci->ski", shares, normals[model.faces]).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    count = len(points)
+    return PointCloud(
+        points, directions, np.full(count, 1e-3), np.zeros(count, np.int16), ("cloud",)
+    )
+
+
+def _elbow_bent(model: BodyModel, degrees: float) -> Array:
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("forearm_left"), 0] = np.radians(degrees)
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    return model.vertices(state)
+
+
+def _verdict(model: BodyModel, lost: list[str], shifts: dict[str, float]):  # type: ignore[no-untyped-def]
+    sides = {"front": 0.9, "back": 0.9}
+    return judge((), sides, (), lost, 1.75, np.zeros(model.beta_count), shifts)
+
+
+def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:
+    patches = unmatched_patches(model, _elbow_bent(model, -30.0), _scan_of(model, model.mean))
+    assert 0.0060 < patches[0].area_m2 < 0.1
+    reasons = lost_parts(model, patches)
+    assert any("left" in reason and "does not match the scan" in reason for reason in reasons)
+    assert not any("right" in reason for reason in reasons)
+    assert _verdict(model, reasons, {}).status == "rescan"
+
+
+def test_folds_and_stray_readings_are_no_lost_limb(model: BodyModel) -> None:
+    """A fold of 25 mm, 3 cm long and 1 cm wide, and readings scattered over the booth."""
+    cloud = _scan_of(model, model.mean)
+    navel = cloud.points[np.argmin(np.linalg.norm(cloud.points - (0.0, -0.2, 1.0), axis=1))]
+    away = np.abs(cloud.points - navel)
+    fold = (away[:, 0] < 0.015) & (away[:, 2] < 0.005)
+    points = cloud.points - 0.025 * fold[:, None] * cloud.normals
+    rng = np.random.default_rng(4)
+    stray = rng.choice(len(points), 60, replace=False)
+    points[stray] = rng.uniform((-0.8, -0.7, 0.0), (0.8, 0.7, 2.0), (60, 3))
+    patches = unmatched_patches(model, model.mean, replace(cloud, points=points))
+    assert patches
+    assert lost_parts(model, patches) == []
+
+
+def test_something_beside_the_person_is_no_limb(model: BodyModel) -> None:
+    cloud = _scan_of(model, model.mean)
+    box = cloud.points[:, 2] < 0.25
+    beside = np.where(box[:, None], cloud.points + np.array([0.9, 0.0, 0.0]), cloud.points)
+    reasons = lost_parts(model, unmatched_patches(model, model.mean, replace(cloud, points=beside)))
+    assert len(reasons) == 1
+    assert "take other things out of the booth" in reasons[0]
+
+
+def test_a_camera_a_few_millimetres_off_is_a_note(model: BodyModel) -> None:
+    """A second scan would show it again."""
+    assert _verdict(model, [], {"front-upper": 0.0015}).notes == ()
+    noted = _verdict(model, [], {"front-upper": 0.0031})
+    assert noted.status == "ok"
+    assert "front-upper has moved by 3 mm" in noted.notes[0]
+    unusable = _verdict(model, [], {"front-upper": 0.0052})
+    assert unusable.status == "rescan"
+    assert unusable.notes == ()
