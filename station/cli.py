@@ -32,6 +32,9 @@ COMMANDS = {
     "backup": ("station.administration.backup:backup", "save what makes this booth"),
     "restore": ("station.administration.restore:restore", "bring a backup back"),
     "migrate": ("station.administration.migrate:migrate_command", "bring old files up to date"),
+    "console": ("station.console.console_cli:console", "the operator's page and the API"),
+    "token": ("station.console.console_cli:token", "who may use the API"),
+    "deliver": ("station.handover.deliver_cli:deliver", "hand results over to other programs"),
     "record-virtual": ("station.simulation.record_cli:record_virtual", "record a virtual person"),
 }
 

@@ -39,6 +39,9 @@ def make_station(booth: Path, tmp_path: Path) -> Iterator[Callable[[str], Statio
     def make(extra: str = "", change: Callable[[str], str] = lambda text: text) -> Station:
         config = tmp_path / "booth.toml"
         text = (booth / "booth.toml").read_text().replace('recording = "', f'recording = "{booth}/')
+        if "[console]" not in extra:
+            # Several stations at once would all want its port.
+            extra += "\n[console]\nenabled = false"
         config.write_text(f'calibration = "{booth}/calibration.json"\n{change(text)}\n{extra}\n')
         running.append(Station(config))
         return running[-1]

@@ -86,7 +86,7 @@ TERMS = {
 
 
 def split_side(name: str) -> tuple[str, Side]:
-    """A row's name without its side, and the side: "wrist_girth_left" -> ("wrist_girth", "left")."""
+    """A row's name without its side, and the side: wrist_girth_left -> (wrist_girth, left)."""
     stem, _, last = name.rpartition("_")
     if last == "left":
         return stem, "left"

@@ -45,6 +45,10 @@ def services(config: BoothConfig, path: Path) -> list[Service]:
     ]
     if config.workers.count:
         table.append(Service("workers", (python, "-m", "workers.cli", "work", *option)))
+    if config.console.enabled:
+        table.append(Service("console", (*station, "console", *option)))
+    if config.deliver:
+        table.append(Service("deliver", (*station, "deliver", *option)))
     return table
 
 

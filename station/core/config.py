@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, SerializeAsAny, ValidationError, model_validator
 
-from station.core.drivers import BASE_FOLDER, AnyCamera, CameraConfig, ConfigPath, Strict
+from station.core.drivers import BASE_FOLDER, AnyCamera, CameraConfig, ConfigPath, Name, Strict
 from station.core.errors import ConfigError
 
 DEFAULT_PATH = Path("booth.toml")
@@ -118,6 +118,49 @@ class RetentionConfig(Strict):
     result_days: float = Field(default=30.0, ge=0.0, description="results and failed scans")
 
 
+class ConsoleConfig(Strict):
+    """The operator's page and the API."""
+
+    enabled: bool = Field(default=True, description="whether the station runs a console")
+    host: str = Field(default="127.0.0.1", description="address to listen at; 0.0.0.0 for all")
+    port: int = Field(default=8420, ge=1, le=65535)
+    names: tuple[str, ...] = Field(
+        default=(), description="names under which browsers reach it, beside the host's own"
+    )
+    folder: ConfigPath = Field(default=Path("console"), description="password, tokens, log")
+    language: Literal["en", "zh"] = "en"
+    unit: Literal["cm", "in"] = "cm"
+    countdown_s: int = Field(default=3, ge=0, le=30, description="before a scan, for the person")
+    preview_hz: float = Field(default=8.0, gt=0.0, le=10.0, description="of the depth pictures")
+    session_hours: float = Field(default=12.0, gt=0.0, le=720.0, description="then: log in again")
+    recordings: ConfigPath | None = Field(
+        default=None, description="calibrate from DIR/<step>/<camera> (training, demonstrations)"
+    )
+
+
+class DeliverConfig(Strict):
+    """Another program that gets every result: a folder, or a webhook."""
+
+    name: Name = Field(description="its name in the status")
+    folder: ConfigPath | None = Field(default=None, description="results are copied into it")
+    url: str | None = Field(default=None, description="results are announced to it by POST")
+    secret_file: ConfigPath | None = Field(
+        default=None, description="holds the key that signs what is posted (HMAC-SHA256)"
+    )
+    link: str = Field(default="", description="where that program reaches the console: https://...")
+    rescans: bool = Field(default=False, description="also results that should be scanned again")
+
+    @model_validator(mode="after")
+    def _has_one_target(self) -> Self:
+        if (self.folder is None) == (self.url is None):
+            raise ValueError(f"deliver {self.name}: give either folder or url")
+        if self.url is not None and not self.url.startswith(("http://", "https://")):
+            raise ValueError(f"deliver {self.name}: the url begins with https:// or http://")
+        if self.url is not None and self.secret_file is None:
+            raise ValueError(f"deliver {self.name}: a url needs secret_file, to sign posts")
+        return self
+
+
 class RuntimeConfig(Strict):
     """Sockets and logs."""
 
@@ -147,6 +190,8 @@ class BoothConfig(Strict):
     workers: WorkersConfig = _section()
     retention: RetentionConfig = _section()
     runtime: RuntimeConfig = _section()
+    console: ConsoleConfig = _section()
+    deliver: tuple[DeliverConfig, ...] = ()
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
@@ -154,6 +199,9 @@ class BoothConfig(Strict):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"the camera name {twice[0]} is used twice")
+        targets = [target.name for target in self.deliver]
+        if len(set(targets)) < len(targets):
+            raise ValueError("each [[deliver]] needs a name of its own")
         named = (*self.calibrate.front, *filter(None, [self.calibrate.reference]))
         for name in named:
             if name not in names:
@@ -251,7 +299,8 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
     if problem["type"] == "extra_forbidden":
         section: Any = model
         for part in problem["loc"][:-1]:
-            section = section.model_fields[part].annotation
+            many = isinstance(part, int)
+            section = section.__args__[0] if many else section.model_fields[part].annotation
         return f"unknown key {key}; allowed here: {', '.join(section.model_fields)}"
     message = problem["msg"].removeprefix("Value error, ")
     return f"{key}: {message} (found {problem['input']!r:.80})"

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from station.archive.index import FILE, ScanIndex
+from station.archive.records import ScanRecord
 from station.booth.retention import purge
 from station.cli import station
 from station.core.files import write_json
@@ -28,7 +29,11 @@ def spool(tmp_path: Path) -> Spool:
     ):
         folder = spool.path(place, f"2026112{number}T100000Z-000{number}")
         folder.mkdir()
-        document = {"label": label, "created": f"2026-11-2{number}T10:00:00Z", "booth": "b"}
+        document: dict[str, object] = {
+            "label": label,
+            "created": f"2026-11-2{number}T10:00:00Z",
+            "booth": "b",
+        }
         if place == "outbox":
             document |= {"status": "ok" if number == 1 else "rescan", "reasons": ["arm"]}
             write_json(folder / "result.json", document)
@@ -37,6 +42,12 @@ def spool(tmp_path: Path) -> Spool:
         if place == "failed":
             write_json(folder / REASON, {"reason": "nobody there"})
     return spool
+
+
+def _got(index: ScanIndex, scan_id: str) -> ScanRecord:
+    found = index.get(scan_id)
+    assert found is not None
+    return found
 
 
 def _labels(index: ScanIndex, *text: str) -> list[str]:
@@ -80,9 +91,9 @@ def test_a_lost_or_damaged_index_is_made_anew(spool: Spool, damage: bytes) -> No
 
 def test_the_index_follows_the_folders(spool: Spool) -> None:
     index = ScanIndex(spool)
-    assert index.get("20261120T100000Z-0000").state == "accepted"
+    assert _got(index, "20261120T100000Z-0000").state == "accepted"
     spool.path("queue", "20261120T100000Z-0000").rename(spool.path("work", "20261120T100000Z-0000"))
-    assert index.get("20261120T100000Z-0000").state == "reconstructing"
+    assert _got(index, "20261120T100000Z-0000").state == "reconstructing"
     shutil.rmtree(spool.path("outbox", "20261121T100000Z-0001"))
     assert index.get("20261121T100000Z-0001") is None
     # Nothing of a label stays in the file.
@@ -96,7 +107,7 @@ def test_an_old_result_takes_its_label_from_its_bundle(spool: Spool) -> None:
     bundle = spool.path("done", folder.name)
     bundle.mkdir()
     write_json(bundle / "bundle.json", {"label": "Order 5", "created": "2026-11-25T10:00:01Z"})
-    found = ScanIndex(spool).get(folder.name)
+    found = _got(ScanIndex(spool), folder.name)
     assert (found.label, found.created) == ("Order 5", "2026-11-25T10:00:01Z")
 
 
@@ -146,5 +157,5 @@ def test_purge_by_label(spool: Spool) -> None:
 def test_a_waiting_scan_is_withdrawn_once(spool: Spool) -> None:
     assert spool.withdraw("20261120T100000Z-0000", "cancelled")
     assert not spool.withdraw("20261120T100000Z-0000", "cancelled")
-    assert ScanIndex(spool).get("20261120T100000Z-0000").reasons == ("cancelled",)
+    assert _got(ScanIndex(spool), "20261120T100000Z-0000").reasons == ("cancelled",)
     assert spool.claim() is None

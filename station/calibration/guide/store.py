@@ -73,6 +73,10 @@ class CalibrationStore:
             for folder in self._folders()
         ]
 
+    def name_in_use(self) -> str:
+        """Name of the calibration that the booth reads; empty if it is none of the stored ones."""
+        return next((folder.name for folder in self._folders() if self._is_used(folder)), "")
+
     def newest(self) -> str | None:
         """Name of the last stored calibration, if there is one."""
         return max((folder.name for folder in self._folders()), default=None)

@@ -1,0 +1,87 @@
+"""Two scans compared: each measurement's difference, and how far the surfaces lie apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from station.archive.surfaces import Array, aligned, distances, read_mesh
+from station.archive.tables import DIGITS, PER_METRE, Pose, Unit, read_measurements
+from station.archive.terms import Language, plain_name, split_side
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceDifference:
+    """How far the second body's surface lies from the first's."""
+
+    signed_m: Array
+    """(n,) at each vertex of the first mesh: positive where the second body is larger."""
+
+    @property
+    def rms_m(self) -> float:
+        return float(np.sqrt(np.mean(self.signed_m**2)))
+
+    @property
+    def p95_m(self) -> float:
+        return float(np.quantile(np.abs(self.signed_m), 0.95))
+
+    @property
+    def largest_m(self) -> float:
+        return float(np.abs(self.signed_m).max())
+
+
+def compare_rows(
+    first: Path, second: Path, pose: Pose, unit: Unit, language: Language
+) -> list[dict[str, Any]]:
+    """Each measurement of both results, second less first.
+
+    A difference counts as real where it exceeds what both 95 % intervals explain together
+    (the root of the sum of their half-widths' squares).
+
+    Raises:
+        FormatError: a table is missing or damaged.
+    """
+    ours, theirs = (
+        {row["name"]: row for row in read_measurements(folder, pose)["measurements"]}
+        for folder in (first, second)
+    )
+    scale, digits = PER_METRE[unit], DIGITS[unit]
+    compared = []
+    for name, row in ours.items():
+        if name not in theirs:
+            continue
+        other = theirs[name]
+        difference_m = other["value_m"] - row["value_m"]
+        half_m = [(r["interval95_m"][1] - r["interval95_m"][0]) / 2 for r in (row, other)]
+        uncertain_m = float(np.hypot(*half_m))
+        compared.append(
+            {
+                "name": name,
+                "words": plain_name(name, language, with_side=False),
+                "side": split_side(name)[1],
+                "first": round(scale * row["value_m"], digits),
+                "second": round(scale * other["value_m"], digits),
+                "difference": round(scale * difference_m, digits),
+                "uncertainty": round(scale * uncertain_m, digits),
+                "real": bool(abs(difference_m) > uncertain_m),
+            }
+        )
+    return compared
+
+
+@lru_cache(maxsize=8)
+def compare_surfaces(first: Path, second: Path) -> SurfaceDifference:
+    """The surfaces of two results, the second laid over the first as a rigid whole.
+
+    Both as they stood: limbs that were held otherwise show as differences.
+
+    Raises:
+        FormatError: a mesh is missing or damaged.
+    """
+    here, there = read_mesh(first / "mesh.ply"), read_mesh(second / "mesh.ply")
+    # The first one's vertices inside the second body are where the second is larger.
+    return SurfaceDifference(-distances(here, aligned(there, here)))

@@ -1,0 +1,99 @@
+"""A result's measurements as tables: rows for programs, CSV for spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from station.archive.records import ScanRecord
+from station.archive.terms import Language, plain_name, split_side
+from station.core.errors import FormatError
+
+Unit = Literal["cm", "in", "m"]
+Pose = Literal["as-scanned", "standard"]
+FILES: dict[Pose, str] = {
+    "as-scanned": "measurements.json",
+    "standard": "measurements-standard.json",
+}
+PER_METRE: dict[Unit, float] = {"m": 1.0, "cm": 100.0, "in": 1 / 0.0254}
+DIGITS: dict[Unit, int] = {"m": 4, "cm": 1, "in": 2}
+"""A tenth of a millimetre, a millimetre, a quarter of one: finer than any interval."""
+_HEADS = {
+    "en": ("order", "date", "verdict", "pose", "measurement", "side", "value", "low", "high",
+           "unit", "standard"),
+    "zh": ("订单", "日期", "结论", "姿势", "尺寸", "左右", "数值", "下限", "上限", "单位", "标准"),
+}  # fmt: skip
+_WORDS = {
+    "en": {"ok": "ok", "rescan": "scan again", "as-scanned": "as scanned", "standard": "standard",
+           "left": "left", "right": "right"},
+    "zh": {"ok": "合格", "rescan": "请重新扫描", "as-scanned": "扫描姿势", "standard": "标准姿势",
+           "left": "左", "right": "右"},
+}  # fmt: skip
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+def read_measurements(folder: Path, pose: Pose) -> dict[str, Any]:
+    """A result's table as it lies in its folder.
+
+    Raises:
+        FormatError: it is missing, damaged or of another version.
+    """
+    path = folder / FILES[pose]
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError:
+        raise FormatError(f"{folder.name} has no {path.name}; scan again") from None
+    except ValueError as cause:
+        raise FormatError(f"{path.name} of {folder.name} is damaged ({cause})") from None
+    known = isinstance(document, dict) and document.get("format") == "booth-measurements"
+    if not known or document.get("version") != 1:
+        raise FormatError(f"{path} is not booth-measurements version 1")
+    return dict(document)
+
+
+def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[str, Any]]:
+    """Each row with its plain name, side, value and 95 % interval in a unit."""
+    return [_row(entry, unit, language) for entry in document["measurements"]]
+
+
+def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any]:
+    name, (low_m, high_m) = str(entry["name"]), entry["interval95_m"]
+    value, low, high = (
+        round(PER_METRE[unit] * length, DIGITS[unit])
+        for length in (entry["value_m"], low_m, high_m)
+    )
+    return {
+        "name": name,
+        "words": plain_name(name, language, with_side=False),
+        "side": split_side(name)[1],
+        "value": value,
+        "low": low,
+        "high": high,
+        "standard": str(entry.get("standard", "")),
+    }
+
+
+def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: Language) -> str:
+    """A line for each measurement, each with the order, the date, the verdict and the pose.
+
+    Begins with a byte order mark: without one spreadsheets take UTF-8 for something else.
+    """
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\r\n")
+    writer.writerow(_HEADS[language])
+    words = _WORDS[language]
+    verdict, pose = words.get(scan.verdict, scan.verdict), words[document["pose"]]
+    for row in rows(document, unit, language):
+        side = words.get(row["side"], "")
+        texts = (scan.label or scan.scan_id, scan.created, verdict, pose, row["words"], side)
+        numbers = (row["value"], row["low"], row["high"], unit, row["standard"])
+        writer.writerow([*map(_harmless, texts), *numbers])
+    return "\ufeff" + stream.getvalue()
+
+
+def _harmless(text: str) -> str:
+    """A label is somebody's text: a spreadsheet must not take it for a formula."""
+    return f"'{text}" if text.startswith(_FORMULA) else text

@@ -1,0 +1,239 @@
+"""Logging in, the booth's state, sensors on and off, the check, the calibration."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from fastapi import APIRouter, Request, Response
+
+from station.calibration.guide.store import CalibrationStore, Entry
+from station.console.api.console import (
+    COOKIE,
+    Booth,
+    Caller,
+    Console,
+    IdempotencyKey,
+    Manager,
+    Reader,
+    Scanner,
+    caller_of,
+    once,
+)
+from station.console.api.models import (
+    Answer,
+    BoothState,
+    Calibration,
+    CameraShift,
+    Check,
+    Delivery,
+    Login,
+    NewStep,
+    Session,
+    Streaming,
+    Task,
+)
+from station.console.api.problems import ProblemError, responses
+from station.console.live.control import command
+from station.core.errors import CalibrationError
+from station.core.geometry import invert, so3_log
+from station.handover.ledger import Ledger
+from station.messaging.messages import Request as ControlRequest
+
+router = APIRouter()
+
+
+@router.get("/session", responses=responses(), tags=["session"])
+def session(request: Request, console: Booth) -> Session:
+    """Who asks, and whether a login is needed."""
+    try:
+        caller: Caller | None = caller_of(request)
+    except ProblemError:
+        caller = None
+    return _session(console, caller)
+
+
+@router.post("/session", responses=responses(429), tags=["session"])
+def log_in(body: Login, request: Request, response: Response, console: Booth) -> Session:
+    """Log in; the session is a cookie."""
+    address = request.client.host if request.client else "?"
+    wait_s = console.throttle.wait_s(address, time.monotonic())
+    if wait_s > 0:
+        raise ProblemError(
+            429, "too-many-tries", f"too many wrong passwords; wait {wait_s:.0f} s",
+            {"Retry-After": str(int(wait_s) + 1)},
+        )  # fmt: skip
+    if not console.vault.check_password(body.password):
+        console.throttle.failed(address, time.monotonic())
+        console.audit.note("?", address, "wrong password")
+        raise ProblemError(401, "wrong-password", "the password is wrong")
+    console.throttle.succeeded(address)
+    console.audit.note("operator", address, "log in")
+    hours = console.config.console.session_hours
+    response.set_cookie(
+        COOKIE,
+        console.vault.open_session(hours),
+        max_age=int(3600 * hours),
+        httponly=True,
+        samesite="strict",
+        secure=request.url.scheme == "https",
+        path="/",
+    )
+    return _session(console, Caller("operator", address, ("read", "scan", "manage")))
+
+
+@router.delete("/session", responses=responses(), tags=["session"])
+def log_out(request: Request, response: Response, console: Booth) -> Session:
+    """Forget this session."""
+    cookie = request.cookies.get(COOKIE)
+    if cookie is not None:
+        console.vault.close_session(cookie)
+    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+    return _session(console, None)
+
+
+def _session(console: Console, caller: Caller | None) -> Session:
+    config = console.config.console
+    return Session(
+        logged_in=caller is not None,
+        password_set=console.vault.has_password,
+        name=caller.name if caller else "",
+        scopes=list(caller.scopes) if caller else [],
+        language=config.language,
+        unit=config.unit,
+        countdown_s=config.countdown_s,
+        recordings=config.recordings is not None,
+    )
+
+
+@router.get("/booth", responses=responses(), tags=["booth"])
+def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
+    """Cameras with their remedies, framesets, spool, disk, calibration, hand-overs."""
+    check = console.tasks.last_check()
+    ledger = Ledger(console.config.spool.folder)
+    return BoothState(
+        **console.watch.booth(),
+        calibration=_store(console).name_in_use(),
+        last_check=Check(time=check["time"], moved=check["moved"]) if check else None,
+        waiting_deliveries=[Delivery(**entry.document()) for entry in ledger.waiting()],
+    )
+
+
+@router.post("/booth/start", responses=responses(409), tags=["booth"])
+def start(console: Booth, caller: Scanner) -> Streaming:  # noqa: ARG001
+    """Sensors on; the cameras' states tell when each gives frames."""
+    command(console.config, ControlRequest("start"))
+    return Streaming(streaming=True)
+
+
+@router.post("/booth/stop", responses=responses(409), tags=["booth"])
+def stop(console: Booth, caller: Scanner) -> Streaming:  # noqa: ARG001
+    """Sensors off; scans that were accepted go on."""
+    command(console.config, ControlRequest("stop"))
+    return Streaming(streaming=False)
+
+
+@router.post("/booth/check", status_code=202, responses=responses(409), tags=["booth"])
+def check(console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Task:
+    """Compare the empty booth with its calibration: begins, `/task` tells how it goes."""
+    if _first(console, caller, key, "check"):
+        console.tasks.check()
+    return Task(**console.tasks.state())
+
+
+@router.get("/task", responses=responses(), tags=["calibration"])
+def task(console: Booth, caller: Reader) -> Task:  # noqa: ARG001
+    """The calibration step or check that runs, or the last one that did."""
+    return Task(**console.tasks.state())
+
+
+@router.delete("/task", responses=responses(), tags=["calibration"])
+def stop_task(console: Booth, caller: Manager) -> Task:  # noqa: ARG001
+    """Stop what runs; what was seen is kept."""
+    return Task(**console.tasks.stop())
+
+
+@router.post("/task/answer", responses=responses(409), tags=["calibration"])
+def answer(body: Answer, console: Booth, caller: Manager) -> Task:  # noqa: ARG001
+    """Say "go", "yes" or "no" to what waits."""
+    return Task(**console.tasks.answer(body.answer))
+
+
+@router.post("/calibration", status_code=202, responses=responses(409), tags=["calibration"])
+def calibrate(body: NewStep, console: Booth, caller: Manager, key: IdempotencyKey = None) -> Task:
+    """Begin a step of the calibration, or all that are not done."""
+    if _first(console, caller, key, body.model_dump_json()):
+        console.audit.note(caller.name, caller.address, f"calibrate {body.step}")
+        console.tasks.calibrate(body.step, body.new)
+    return Task(**console.tasks.state())
+
+
+def _first(console: Console, caller: Caller, key: str | None, request: str) -> bool:
+    """Whether a key has not begun this before."""
+    mark = f"{time.time_ns()}"
+    return once(console, caller, key, request, mark) == mark
+
+
+@router.get("/calibrations", responses=responses(409), tags=["calibration"])
+def calibrations(console: Booth, caller: Reader) -> list[Calibration]:  # noqa: ARG001
+    """All stored calibrations, the newest first."""
+    return [_calibration(entry) for entry in reversed(_store(console).entries())]
+
+
+@router.post("/calibrations/{name}/use", responses=responses(404, 409), tags=["calibration"])
+def use(name: str, console: Booth, caller: Manager) -> Calibration:
+    """Put a stored calibration into use."""
+    _known(console, name)
+    console.audit.note(caller.name, caller.address, "use a calibration")
+    return _calibration(_store(console).use(name))
+
+
+@router.get(
+    "/calibrations/{first}/comparison/{second}",
+    responses=responses(404, 409),
+    tags=["calibration"],
+)
+def compare(first: str, second: str, console: Booth, caller: Reader) -> list[CameraShift]:  # noqa: ARG001
+    """How far each camera stands elsewhere in the second calibration, seen by the reference."""
+    before, after = _known(console, first).rig, _known(console, second).rig
+    shifts = []
+    for name in before.cameras.keys() & after.cameras.keys():
+        here, there = (
+            invert(rig.cameras[before.reference].world_from_camera)
+            @ rig.cameras[name].world_from_camera
+            for rig in (before, after)
+            if before.reference in rig.cameras
+        )
+        move = invert(here) @ there
+        shifts.append(
+            CameraShift(
+                camera=name,
+                shift_mm=round(1e3 * float(np.linalg.norm(move[:3, 3])), 2),
+                turn_deg=round(float(np.degrees(np.linalg.norm(so3_log(move[:3, :3])))), 3),
+            )
+        )
+    return sorted(shifts, key=lambda shift: shift.camera)
+
+
+def _store(console: Console) -> CalibrationStore:
+    return CalibrationStore(console.config.calibrate.folder, console.config.calibration)
+
+
+def _known(console: Console, name: str) -> Entry:
+    try:
+        entries = {entry.name: entry for entry in _store(console).entries()}
+    except CalibrationError as error:
+        raise ProblemError(409, "not-possible", str(error)) from None
+    if name not in entries:
+        raise ProblemError(404, "no-such-calibration", f"there is no calibration {name}")
+    return entries[name]
+
+
+def _calibration(entry: Entry) -> Calibration:
+    return Calibration(
+        name=entry.name,
+        created=entry.rig.created,
+        cameras=list(entry.rig.cameras),
+        residual_rms_mm=round(1e3 * entry.rig.residual_rms_m, 2),
+        in_use=entry.in_use,
+    )

@@ -1,0 +1,244 @@
+"""What requests hold and what is answered."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+State = Literal[
+    "countdown", "armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"
+]
+Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Login(_Strict):
+    """What the operator types."""
+
+    password: str = Field(max_length=1000)
+
+
+class Session(BaseModel):
+    """Who asks, and how the page shows things."""
+
+    logged_in: bool
+    password_set: bool
+    name: str
+    scopes: list[str]
+    language: Literal["en", "zh"]
+    unit: Literal["cm", "in"]
+    countdown_s: int
+    recordings: bool = Field(description="calibrations replay recordings")
+
+
+class Camera(BaseModel):
+    """One camera."""
+
+    name: str
+    state: str = Field(description="off, opening, streaming, lost or dead")
+    detail: str = Field(description="what is wrong and what to do; empty if nothing is")
+    frames: int
+    lost: int
+
+
+class Check(BaseModel):
+    """The last comparison of the empty booth with its calibration."""
+
+    time: str
+    moved: list[str]
+
+
+class Delivery(BaseModel):
+    """What another program has not been given yet."""
+
+    target: str
+    scan_id: str
+    tries: int
+    next_try: str
+    error: str
+
+
+class BoothState(BaseModel):
+    """The booth now."""
+
+    running: bool
+    fault: str = Field(description="why no station answers; empty if one does")
+    streaming: bool
+    cameras: list[Camera]
+    framesets_hz: float | None
+    spool: dict[str, int]
+    disk_free_mb: float
+    disk_needed_mb: float
+    calibration: str = Field(description="date of the calibration in use; empty if there is none")
+    last_check: Check | None
+    waiting_deliveries: list[Delivery]
+
+
+class Streaming(BaseModel):
+    """Whether the sensors are wanted on."""
+
+    streaming: bool
+
+
+class NewScan(_Strict):
+    """A scan to be taken."""
+
+    label: Label = Field(default="", description="whose scan it is, e.g. an order's number")
+    countdown_s: int = Field(default=0, ge=0, le=30, description="for the person, before it")
+
+
+class Scan(BaseModel):
+    """One scan, from the word to the result."""
+
+    scan_id: str
+    label: str
+    booth: str
+    state: State
+    verdict: Literal["", "ok", "rescan", "failed"]
+    may_leave: bool = Field(description="the scan is on disk: the person may leave")
+    reasons: list[str]
+    created: str = Field(description="ISO 8601, UTC")
+    finished: str
+    seconds: dict[str, float] = Field(description="what each step of the reconstruction took")
+    framesets: int
+    wanted: int
+
+
+class ScanPage(BaseModel):
+    """Scans, the newest first."""
+
+    scans: list[Scan]
+    next: str = Field(description="`cursor` of the next page; empty at the end")
+
+
+class Removed(BaseModel):
+    """What was deleted."""
+
+    scans: list[str]
+
+
+class File(BaseModel):
+    """One file of a result."""
+
+    name: str
+    bytes: int
+    sha256: str
+    media_type: str
+
+
+class Row(BaseModel):
+    """One measurement."""
+
+    name: str
+    words: str
+    side: Literal["", "left", "right"]
+    value: float
+    low: float = Field(description="lower end of the 95 % interval")
+    high: float
+    standard: str
+
+
+class Measurements(BaseModel):
+    """A result's table."""
+
+    scan_id: str
+    label: str
+    verdict: str
+    created: str
+    pose: Literal["as-scanned", "standard"]
+    unit: Literal["cm", "in", "m"]
+    rows: list[Row]
+
+
+class Part(BaseModel):
+    """How well one part of the body was seen."""
+
+    name: str
+    coverage: float
+    residual_rms_m: float | None
+    doubtful: bool = Field(description="the verdict's reasons name it")
+
+
+class Quality(BaseModel):
+    """Why a result can be trusted, or not."""
+
+    verdict: str
+    reasons: list[str]
+    parts: list[Part]
+
+
+class ComparedRow(BaseModel):
+    """One measurement of two scans."""
+
+    name: str
+    words: str
+    side: Literal["", "left", "right"]
+    first: float
+    second: float
+    difference: float
+    uncertainty: float = Field(description="what both 95 % intervals explain together")
+    real: bool = Field(description="the difference exceeds that")
+
+
+class Comparison(BaseModel):
+    """Two scans; surfaces as they stood, the second laid over the first as a rigid whole."""
+
+    first: Scan
+    second: Scan
+    pose: Literal["as-scanned", "standard"]
+    unit: Literal["cm", "in", "m"]
+    rows: list[ComparedRow]
+    surface_rms_m: float
+    surface_p95_m: float
+    surface_largest_m: float
+
+
+class Calibration(BaseModel):
+    """A stored calibration."""
+
+    name: str
+    created: str
+    cameras: list[str]
+    residual_rms_mm: float
+    in_use: bool
+
+
+class CameraShift(BaseModel):
+    """How a camera stands in the second calibration, against the first, seen by the reference."""
+
+    camera: str
+    shift_mm: float
+    turn_deg: float
+
+
+class NewStep(_Strict):
+    """A step of the calibration."""
+
+    step: Literal["all", "floor", "ball", "mark", "front", "around", "depth", "solve"] = "all"
+    new: bool = Field(default=False, description="begin anew; what was seen is set aside")
+
+
+class Answer(_Strict):
+    """What the operator says to a running step."""
+
+    answer: Literal["go", "yes", "no"]
+
+
+class Task(BaseModel):
+    """A calibration step or a check: what it says and what it waits for."""
+
+    kind: str
+    step: str
+    running: bool
+    title: str
+    instruction: str
+    progress: str
+    question: str
+    waits_for: str
+    countdown_s: int | None
+    lines: list[str]
+    error: str

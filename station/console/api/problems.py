@@ -1,0 +1,104 @@
+"""Errors as problem documents (RFC 9457), with the words and remedies of the commands."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+from station.console.live.control import NotRunningError, RefusedError
+from station.core.errors import BoothError
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(BaseModel):
+    """A problem document, RFC 9457."""
+
+    type: str = Field(description="/problems/<kind>; stays the same over releases")
+    title: str
+    status: int
+    detail: str = Field(description="what is wrong and what to do, as the commands say it")
+
+
+class ProblemError(Exception):
+    """Ends a request with a problem document."""
+
+    def __init__(
+        self, status: int, kind: str, detail: str, headers: dict[str, str] | None = None
+    ) -> None:
+        super().__init__(detail)
+        self.status, self.kind, self.detail, self.headers = status, kind, detail, headers
+
+
+_MEANINGS = {
+    400: "The range cannot be read",
+    401: "Log in, or give a valid token",
+    403: "Not within the token's scopes, or sent by another site",
+    404: "No such thing here",
+    408: "The request came too slowly",
+    409: "The station refuses; the detail says why and what to do",
+    413: "The body is too large",
+    416: "The range lies outside the file",
+    421: "The console does not go by this name",
+    422: "A value is missing or impossible",
+    429: "Too many wrong passwords; Retry-After says how long to wait",
+    503: "No station answers",
+}
+_ALWAYS = (401, 403, 408, 413, 421, 422, 503)
+
+
+def responses(*more: int) -> dict[int | str, dict[str, Any]]:
+    """What a route may answer beside its result, for the OpenAPI document."""
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    found: dict[int | str, dict[str, Any]] = {
+        status: {"description": _MEANINGS[status], "content": {MEDIA_TYPE: schema}}
+        for status in sorted({*_ALWAYS, *more})
+    }
+    for status in {400, 416} & found.keys():
+        found[status]["content"] = {"text/plain": {"schema": {"type": "string"}}}
+    return found
+
+
+def install(app: FastAPI) -> None:
+    """Let every error of the app end as a problem document."""
+
+    @app.exception_handler(ProblemError)
+    async def _problem(request: Request, error: ProblemError) -> JSONResponse:  # noqa: ARG001
+        return _answer(error.status, error.kind, error.detail, error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(
+        request: Request,  # noqa: ARG001
+        error: RequestValidationError,
+    ) -> JSONResponse:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        return _answer(422, "invalid", f"{where}: {first['msg']}")
+
+    @app.exception_handler(BoothError)
+    async def _booth(request: Request, error: BoothError) -> JSONResponse:  # noqa: ARG001
+        if isinstance(error, NotRunningError):
+            return _answer(503, "station-not-running", str(error))
+        kind = "refused" if isinstance(error, RefusedError) else "not-possible"
+        return _answer(409, kind, str(error))
+
+    @app.exception_handler(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        kind = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http")
+        detail = f"{request.method} {request.url.path}: {error.detail}"
+        headers = dict(error.headers) if error.headers else None
+        return _answer(error.status_code, kind, detail, headers)
+
+
+def _answer(
+    status: int, kind: str, detail: str, headers: dict[str, str] | None = None
+) -> JSONResponse:
+    title = HTTPStatus(status).phrase if kind == "http" else kind.replace("-", " ")
+    problem = Problem(type=f"/problems/{kind}", title=title, status=status, detail=detail)
+    return JSONResponse(problem.model_dump(), status, headers, media_type=MEDIA_TYPE)

@@ -1,0 +1,271 @@
+"""Results: files, tables, exports, comparisons. Every access is in the audit log."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Header, Query, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse
+
+from station.archive.bundle_zip import MEDIA_TYPES, result_zip
+from station.archive.compare import compare_rows, compare_surfaces
+from station.archive.sheet import sheet_pdf
+from station.archive.smis import smis
+from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows
+from station.archive.terms import Language
+from station.console.api.console import SCAN_ID, Booth, Caller, Console, Reader, ScanId
+from station.console.api.models import Comparison, File, Measurements, Part, Quality
+from station.console.api.problems import ProblemError, responses
+from station.console.api.scans import of_record
+from station.core.errors import FormatError
+
+router = APIRouter(prefix="/scans/{scan_id}", tags=["results"])
+FileName = Annotated[str, PathParameter(pattern=r"^[a-z0-9][a-z0-9.-]{0,60}$")]
+PoseQuery = Annotated[Pose, Query(description="as the person stood, or in the standard pose")]
+UnitQuery = Annotated[Unit, Query()]
+LanguageQuery = Annotated[Language, Query()]
+
+
+def _open(console: Console, caller: Caller, scan_id: str, what: str) -> tuple[Any, Path]:
+    record, folder = console.result(scan_id)
+    console.audit.note(caller.name, caller.address, f"read {what}", scan_id)
+    return record, folder
+
+
+@router.get("/files", responses=responses(404))
+def files(scan_id: ScanId, console: Booth, caller: Reader) -> list[File]:
+    """The result's files."""
+    _, folder = _open(console, caller, scan_id, "list of files")
+    hashes = _result(folder).get("files", {})
+    return [
+        File(
+            name=path.name,
+            bytes=path.stat().st_size,
+            sha256=str(hashes.get(path.name, "")),
+            media_type=MEDIA_TYPES.get(path.suffix, "application/octet-stream"),
+        )
+        for path in sorted(folder.iterdir())
+        if path.is_file()
+    ]
+
+
+_ANY_FILE: dict[str, Any] = {
+    media: {"schema": {"type": "string", "format": "binary"}}
+    for media in sorted({*MEDIA_TYPES.values(), "application/octet-stream"})
+}
+
+
+@router.get(
+    "/files/{name}",
+    response_class=FileResponse,
+    responses={
+        **responses(400, 404, 416),
+        200: {"description": "The file", "content": _ANY_FILE},
+        206: {"description": "A range of it", "content": _ANY_FILE},
+        304: {"description": "The file that If-None-Match names"},
+    },
+)
+def file(
+    scan_id: ScanId,
+    name: FileName,
+    console: Booth,
+    caller: Reader,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Response:
+    """One file; ranges and entity tags are understood."""
+    _, folder = _open(console, caller, scan_id, name)
+    path = folder / name
+    if path.is_symlink() or not path.is_file() or path.parent != folder:
+        raise ProblemError(404, "no-such-file", f"scan {scan_id} has no file {name}")
+    digest = _result(folder).get("files", {}).get(name) or f"{path.stat().st_mtime_ns:x}"
+    tag = f'"{digest}"'
+    if if_none_match and tag in (part.strip() for part in if_none_match.split(",")):
+        return Response(status_code=304, headers={"etag": tag})
+    media = MEDIA_TYPES.get(path.suffix, "application/octet-stream")
+    return FileResponse(path, media_type=media, headers={"etag": tag, "cache-control": "no-cache"})
+
+
+@router.get("/quality", responses=responses(404))
+def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
+    """How well each part of the body was seen, and which one the verdict doubts."""
+    record, folder = _open(console, caller, scan_id, "quality")
+    parts = _result(folder).get("quality", {}).get("parts", {})
+    reasons = " ".join(record.reasons)
+    return Quality(
+        verdict=record.verdict,
+        reasons=list(record.reasons),
+        parts=[
+            Part(
+                name=name,
+                coverage=part["coverage"],
+                residual_rms_m=part["residual_rms_m"],
+                doubtful=re.search(rf"\b{_words(name)}\b", reasons) is not None,
+            )
+            for name, part in parts.items()
+        ],
+    )
+
+
+def _words(part: str) -> str:
+    """A part as reasons name it: forearm_left -> left forearm."""
+    stem, _, side = part.rpartition("_")
+    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
+
+
+@router.get("/measurements", responses=responses(404, 409))
+def measurements(
+    scan_id: ScanId,
+    console: Booth,
+    caller: Reader,
+    pose: PoseQuery = "as-scanned",
+    unit: UnitQuery = "cm",
+    language: LanguageQuery = "en",
+) -> Measurements:
+    """The table, each row with its 95 % interval."""
+    record, folder = _open(console, caller, scan_id, "measurements")
+    table = rows(read_measurements(folder, pose), unit, language)
+    return Measurements(
+        scan_id=scan_id,
+        label=record.label,
+        verdict=record.verdict,
+        created=record.created,
+        pose=pose,
+        unit=unit,
+        rows=table,  # type: ignore[arg-type]  # pydantic reads them
+    )
+
+
+def _document(media: str, what: str) -> dict[int | str, dict[str, Any]]:
+    content = {media: {"schema": {"type": "string", "format": "binary"}}}
+    return {**responses(404, 409), 200: {"description": what, "content": content}}
+
+
+def _attached(content: bytes, media: str, name: str) -> Response:
+    disposition = f'attachment; filename="{name}"'
+    return Response(content, media_type=media, headers={"content-disposition": disposition})
+
+
+@router.get(
+    "/measurements.csv", response_class=Response, responses=_document("text/csv", "The table")
+)
+def measurements_csv(
+    scan_id: ScanId,
+    console: Booth,
+    caller: Reader,
+    pose: PoseQuery = "as-scanned",
+    unit: UnitQuery = "cm",
+    language: LanguageQuery = "en",
+) -> Response:
+    """The table for a spreadsheet."""
+    record, folder = _open(console, caller, scan_id, "measurements")
+    table = csv_table(record, read_measurements(folder, pose), unit, language)
+    return _attached(table.encode(), "text/csv", f"{scan_id}-{pose}-{unit}.csv")
+
+
+@router.get(
+    "/individual.smis",
+    response_class=Response,
+    responses=_document("application/xml", "SeamlyMe's individual measurements"),
+)
+def individual_smis(
+    scan_id: ScanId, console: Booth, caller: Reader, pose: PoseQuery = "as-scanned"
+) -> Response:
+    """The table for SeamlyMe and Seamly2D."""
+    record, folder = _open(console, caller, scan_id, "measurements")
+    content = smis(record, read_measurements(folder, pose))
+    return _attached(content, "application/xml", f"{scan_id}.smis")
+
+
+@router.get(
+    "/sheet.pdf",
+    response_class=Response,
+    responses=_document("application/pdf", "One A4 page"),
+)
+def sheet(
+    scan_id: ScanId,
+    console: Booth,
+    caller: Reader,
+    pose: PoseQuery = "as-scanned",
+    unit: UnitQuery = "cm",
+    language: LanguageQuery = "en",
+) -> Response:
+    """A printable sheet: every line drawn on the body, and the table."""
+    record, folder = _open(console, caller, scan_id, "sheet")
+    content = sheet_pdf(record, folder, pose, unit, language)
+    name = f'inline; filename="{scan_id}.pdf"'
+    return Response(content, media_type="application/pdf", headers={"content-disposition": name})
+
+
+@router.get(
+    "/result.zip", response_class=Response, responses=_document("application/zip", "All files")
+)
+def all_files(
+    scan_id: ScanId,
+    console: Booth,
+    caller: Reader,
+    unit: UnitQuery = "cm",
+    language: LanguageQuery = "en",
+) -> Response:
+    """All files, with the tables as CSV, the sheet and the .smis beside them."""
+    record, folder = _open(console, caller, scan_id, "all files")
+    content = result_zip(record, folder, unit, language)
+    return _attached(content, "application/zip", f"{scan_id}.zip")
+
+
+Other = Annotated[str, PathParameter(pattern=SCAN_ID)]
+
+
+@router.get("/comparison/{other}", responses=responses(404, 409))
+def comparison(
+    scan_id: ScanId,
+    other: Other,
+    console: Booth,
+    caller: Reader,
+    pose: PoseQuery = "as-scanned",
+    unit: UnitQuery = "cm",
+    language: LanguageQuery = "en",
+) -> Comparison:
+    """The other scan less this one: each measurement, and the surfaces."""
+    record, folder = _open(console, caller, scan_id, "comparison")
+    second, other_folder = _open(console, caller, other, "comparison")
+    surfaces = compare_surfaces(folder, other_folder)
+    return Comparison(
+        first=of_record(record),
+        second=of_record(second),
+        pose=pose,
+        unit=unit,
+        rows=compare_rows(folder, other_folder, pose, unit, language),  # type: ignore[arg-type]
+        surface_rms_m=surfaces.rms_m,
+        surface_p95_m=surfaces.p95_m,
+        surface_largest_m=surfaces.largest_m,
+    )
+
+
+@router.get(
+    "/comparison/{other}/distances",
+    response_class=Response,
+    responses=_document(
+        "application/octet-stream",
+        "float32, little endian, metres: one for each vertex of this scan's mesh.ply, positive "
+        "where the other body is larger",
+    ),
+)
+def comparison_distances(scan_id: ScanId, other: Other, console: Booth, caller: Reader) -> Response:
+    """The distance map of the two surfaces."""
+    _, folder = _open(console, caller, scan_id, "comparison")
+    _, other_folder = _open(console, caller, other, "comparison")
+    signed = compare_surfaces(folder, other_folder).signed_m
+    return Response(signed.astype(np.dtype("<f4")).tobytes(), media_type="application/octet-stream")
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    try:
+        document = json.loads((folder / "result.json").read_bytes())
+    except (OSError, ValueError):
+        raise FormatError(f"the result of {folder.name} is damaged; scan again") from None
+    return dict(document)

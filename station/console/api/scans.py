@@ -1,0 +1,169 @@
+"""Scans: taking, listing, following, cancelling, deleting."""
+
+from __future__ import annotations
+
+import secrets
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query
+
+from station.archive.records import ScanRecord, ScanState
+from station.booth.retention import purge_scan
+from station.console.api.console import (
+    Booth,
+    Console,
+    IdempotencyKey,
+    Manager,
+    Reader,
+    ScanId,
+    Scanner,
+    once,
+)
+from station.console.api.models import NewScan, Removed, Scan, ScanPage
+from station.console.api.problems import ProblemError, responses
+from station.console.live.control import NotRunningError, RefusedError, command
+from station.messaging.messages import Request
+
+router = APIRouter(prefix="/scans", tags=["scans"])
+_ON_DISK = ("accepted", "reconstructing", "delivered", "rescan")
+_MOST_OF_A_LABEL = 1000
+
+
+@router.get("", responses=responses())
+def list_scans(
+    console: Booth,
+    caller: Reader,  # noqa: ARG001
+    text: Annotated[str, Query(max_length=200, description="what label or id contains")] = "",
+    label: Annotated[str | None, Query(max_length=200, description="the whole label")] = None,
+    since: Annotated[str, Query(max_length=40, description="ISO 8601, UTC")] = "",
+    until: Annotated[str, Query(max_length=40, description="ISO 8601, UTC, excluded")] = "",
+    state: Annotated[
+        list[Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]],
+        Query(max_length=5),
+    ] = [],  # noqa: B006  # FastAPI copies it
+    cursor: Annotated[str, Query(max_length=200, description="`next` of the page before")] = "",
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+) -> ScanPage:
+    """Search by label, id, time and state; the newest first."""
+    created, _, scan_id = cursor.partition(" ")
+    states: list[ScanState] = list(state)
+    found = console.index.find(
+        text,
+        label=label,
+        since=since,
+        until=until,
+        states=states,
+        before=(created, scan_id) if cursor else None,
+        limit=limit,
+    )
+    following = f"{found[-1].created} {found[-1].scan_id}" if len(found) == limit else ""
+    return ScanPage(scans=[of_record(record) for record in found], next=following)
+
+
+@router.post("", status_code=202, responses=responses(409))
+def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Scan:
+    """Take a scan. With an Idempotency-Key the same request never scans twice."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    fresh = f"{stamp}-{secrets.token_hex(2)}"
+    scan_id = once(console, caller, key, body.model_dump_json(), fresh)
+    if scan_id != fresh:
+        # Begun before: a finished scan is not begun again even if the station forgot it.
+        with suppress(ProblemError):
+            return _state(console, scan_id)
+    console.audit.note(caller.name, caller.address, "scan", scan_id)
+    session = console.desk.begin(scan_id, body.label, body.countdown_s)
+    return _of_session(session)
+
+
+@router.get("/{scan_id}", responses=responses(404))
+def state(scan_id: ScanId, console: Booth, caller: Reader) -> Scan:  # noqa: ARG001
+    """A scan's state, from the countdown to the result, with its timings."""
+    return _state(console, scan_id)
+
+
+def _state(console: Console, scan_id: str) -> Scan:
+    waiting = console.desk.status(scan_id)
+    if waiting is not None:
+        return _of_session(waiting)
+    record = console.index.get(scan_id)
+    if record is not None:
+        return of_record(record)
+    try:
+        return _of_session(command(console.config, Request("scan-status", scan_id)))
+    except RefusedError as error:
+        raise ProblemError(404, "no-such-scan", str(error)) from None
+    except NotRunningError:
+        raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
+
+
+@router.post("/{scan_id}/cancel", responses=responses(404, 409))
+def cancel(scan_id: ScanId, console: Booth, caller: Scanner) -> Scan:
+    """Give up a scan that is being taken or waits for its reconstruction."""
+    _state(console, scan_id)
+    console.audit.note(caller.name, caller.address, "cancel", scan_id)
+    console.desk.cancel(scan_id)
+    return _state(console, scan_id)
+
+
+@router.delete("/{scan_id}", responses=responses(404, 409))
+def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
+    """Delete a scan, its bundle and its results, for good."""
+    console.record(scan_id)
+    console.audit.note(caller.name, caller.address, "delete", scan_id)
+    purge_scan(console.spool, scan_id)
+    return Removed(scans=[scan_id])
+
+
+@router.delete("", responses=responses(404, 409))
+def delete_label(
+    label: Annotated[str, Query(min_length=1, max_length=200, description="the whole label")],
+    console: Booth,
+    caller: Manager,
+) -> Removed:
+    """Delete all scans with exactly this label."""
+    found = console.index.find(label=label, limit=_MOST_OF_A_LABEL)
+    if not found:
+        raise ProblemError(404, "no-such-scan", "there is no scan with this label")
+    for record in found:
+        console.audit.note(caller.name, caller.address, "delete", record.scan_id)
+        purge_scan(console.spool, record.scan_id)
+    return Removed(scans=[record.scan_id for record in found])
+
+
+def of_record(record: ScanRecord) -> Scan:
+    """A scan on disk."""
+    return Scan(
+        scan_id=record.scan_id,
+        label=record.label,
+        booth=record.booth,
+        state=record.state,
+        verdict=record.verdict,  # type: ignore[arg-type]  # one of the four
+        may_leave=record.state in _ON_DISK,
+        reasons=list(record.reasons),
+        created=record.created,
+        finished=record.finished,
+        seconds=dict(record.seconds),
+        framesets=0,
+        wanted=0,
+    )
+
+
+def _of_session(session: dict[str, Any]) -> Scan:
+    """A scan that the station, or its countdown, tells of."""
+    state = session["state"]
+    return Scan(
+        scan_id=session["scan_id"],
+        label=session["label"],
+        booth="",
+        state=state,
+        verdict="failed" if state == "failed" else "",
+        may_leave=state in _ON_DISK,
+        reasons=[session["reason"]] if session["reason"] else [],
+        created="",
+        finished="",
+        seconds={},
+        framesets=session["framesets"],
+        wanted=session["wanted"],
+    )

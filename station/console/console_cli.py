@@ -1,0 +1,131 @@
+"""`station console`, and `station token`: who may use it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from station.console.security.certificate import make_certificate
+from station.console.security.vault import SCOPES, Scope, Vault
+from station.core.config import BoothConfig, find_config, load_config
+from station.core.service import set_up_logs, stop_event
+
+config_option = click.option(
+    "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
+)
+
+
+@click.command()
+@config_option
+@click.option("--set-password", is_flag=True, help="set the operator's password, and end")
+@click.option("--make-certificate", is_flag=True, help="make a self-signed certificate, and end")
+def console(config_path: Path | None, set_password: bool, make_certificate: bool) -> None:
+    """Serve the operator's page and the API; `station run` starts it.
+
+    Alone on this machine it needs neither password nor certificate. Beyond it (console.host) both.
+
+    \b
+    Examples:
+      station console --set-password
+      station console --make-certificate
+      station console --config booth.toml
+    """
+    path = find_config(config_path)
+    config = load_config(path)
+    if set_password or make_certificate:
+        _prepare(config, set_password, make_certificate)
+        return
+    from station.console.api.console import Console
+    from station.console.server import check_exposure, serve
+
+    log = set_up_logs("console")
+    stop = stop_event()
+    parts = Console(config, path.resolve(), log)
+    check_exposure(config.console, parts.vault.has_password)
+    serve(parts, log, stop)
+
+
+def _prepare(config: BoothConfig, set_password: bool, certificate: bool) -> None:
+    folder = config.console.folder
+    if set_password:
+        text = click.prompt("password", hide_input=True, confirmation_prompt=True)
+        Vault(folder).set_password(text)
+        click.echo("the password is set; whoever was logged in has to log in again")
+    if certificate:
+        path = make_certificate(folder, [*config.console.names, config.console.host])
+        click.echo(f"{path}: browsers will ask once whether to trust it")
+
+
+@click.group()
+def token() -> None:
+    """Make, list and revoke the API's tokens.
+
+    \b
+    Examples:
+      station token make orders --scope read --scope scan
+      station token list
+      station token revoke orders
+    """
+
+
+@token.command("make")
+@click.argument("name")
+@click.option(
+    "--scope", "scopes", type=click.Choice(SCOPES), multiple=True, default=("read",),
+    show_default=True, help="read: see; scan: take scans; manage: delete, calibrate",
+)  # fmt: skip
+@click.option("--days", type=click.FloatRange(min=0.0), help="worthless after so many days")
+@config_option
+def make(
+    name: str, scopes: tuple[Scope, ...], days: float | None, config_path: Path | None
+) -> None:
+    """Make a token and print it, once.
+
+    \b
+    Examples:
+      station token make orders --scope read --scope scan --days 365
+    """
+    secret = _vault(config_path).make_token(name, scopes, days)
+    click.echo(secret)
+    click.echo("keep it: it is not shown again; the station knows its hash alone", err=True)
+
+
+@token.command("list")
+@config_option
+def list_tokens(config_path: Path | None) -> None:
+    """List the tokens: name, scopes, until when.
+
+    \b
+    Examples:
+      station token list
+    """
+    tokens = _vault(config_path).tokens()
+    if not tokens:
+        click.echo("no tokens; station token make NAME makes one")
+    for found in tokens:
+        until = "for ever" if found.expires is None else f"until {_day(found.expires)}"
+        click.echo(f"{found.name:<20} {', '.join(found.scopes):<22} {until}")
+
+
+@token.command("revoke")
+@click.argument("name")
+@config_option
+def revoke(name: str, config_path: Path | None) -> None:
+    """Make a token worthless, at once.
+
+    \b
+    Examples:
+      station token revoke orders
+    """
+    _vault(config_path).revoke_token(name)
+    click.echo(f"token {name} is worthless now")
+
+
+def _vault(config_path: Path | None) -> Vault:
+    return Vault(load_config(find_config(config_path)).console.folder)
+
+
+def _day(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")

@@ -1,0 +1,120 @@
+"""A calibration that is led from the page: `station calibrate` in a process of its own, its guide's
+words as JSON lines, the operator's answers as lines back."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.procedure import Procedure
+from station.calibration.guide.session import FRONT, MARK
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import load_config
+from station.core.errors import BoothError
+
+STEPS = ("all", "floor", "ball", "mark", "front", "around", "depth", "solve")
+_PROGRESS_S = 0.2
+
+
+@dataclass(slots=True)
+class PageGuide(Guide):
+    """A guide whose terminal is the page."""
+
+    _last_s: float = 0.0
+
+    def _say(self, kind: str, **content: Any) -> None:
+        print(json.dumps({"kind": kind, **content}, ensure_ascii=False), flush=True)
+
+    def _answer(self) -> str:
+        line = sys.stdin.readline()
+        if not line:
+            raise KeyboardInterrupt
+        return line.strip()
+
+    def step(self, title: str, instruction: str) -> None:
+        self._say("step", title=title, text=instruction, waits=self.attended)
+        if not self.attended:
+            return
+        self._answer()
+        for left in range(int(self.countdown_s), 0, -1):
+            self._say("countdown", left_s=left)
+            time.sleep(1.0)
+        self._say("countdown", left_s=0)
+
+    def title(self, text: str) -> None:
+        self._say("step", title=text, text="", waits=False)
+
+    def progress(self, text: str, *, now: bool = False) -> None:
+        moment = time.monotonic()
+        if now or moment - self._last_s > _PROGRESS_S:
+            self._last_s = moment
+            self._say("progress", text=text)
+
+    def say(self, text: str) -> None:
+        self._say("line", text=text)
+
+    def done(self, text: str) -> None:
+        self._say("done", text=text)
+
+    def another(self, question: str) -> bool:
+        if not self.attended:
+            return False
+        self._say("question", text=question)
+        return self._answer() == "yes"
+
+    def end_line(self) -> None:
+        """The page has no line that is written over."""
+
+
+def run(config_path: Path, step: str, new: bool) -> None:
+    """One step, or all that are not done.
+
+    Raises:
+        BoothError: as `station calibrate` does.
+    """
+    config = load_config(config_path)
+    recordings = config.console.recordings
+    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    guide = PageGuide(recordings is None, config.calibrate.countdown_s)
+    procedure = Procedure(config, store, recordings, guide)
+    with store.locked():
+        if new:
+            store.set_aside()
+        match step:
+            case "all":
+                procedure.run()
+            case "floor":
+                procedure.empty()
+            case "ball":
+                procedure.ball()
+            case "mark" | "front":
+                procedure.rest(MARK if step == "mark" else FRONT)
+            case "around":
+                procedure.around(asked=False)
+            case "depth":
+                procedure.walls(asked=False)
+            case "solve":
+                procedure.solve()
+
+
+def main() -> int:
+    """`python -m station.console.live.guided CONFIG STEP [new]`; the console starts it."""
+    path, step, *rest = sys.argv[1:]
+    try:
+        run(Path(path), step, "new" in rest)
+    except BoothError as error:
+        print(json.dumps({"kind": "error", "text": str(error)}), flush=True)
+        return 1
+    except KeyboardInterrupt:
+        print(json.dumps({"kind": "error", "text": "stopped; what was seen is kept"}), flush=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""What takes longer than a request: a calibration step, a check of the cameras. One at a time."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from station.console.live.control import RefusedError
+from station.console.live.events import EventLog
+from station.core.files import write_json
+from station.core.service import die_with_parent
+
+_LINES_KEPT = 60
+_EXIT_MOVED = 3
+CHECK_FILE = "last-check.json"
+
+
+class Tasks:
+    """The task that runs, or the last one that did."""
+
+    def __init__(self, config_path: Path, folder: Path, events: EventLog) -> None:
+        self._config_path, self._folder, self._events = config_path, folder, events
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._state = _idle()
+
+    def state(self) -> dict[str, Any]:
+        """What runs, what it says, what it waits for."""
+        with self._lock:
+            return {**self._state, "lines": list(self._state["lines"])}
+
+    def last_check(self) -> dict[str, Any] | None:
+        """When the cameras were checked last, and what was found."""
+        try:
+            document = json.loads((self._folder / CHECK_FILE).read_text())
+        except (OSError, ValueError):
+            return None
+        return document if isinstance(document, dict) else None
+
+    def calibrate(self, step: str, new: bool) -> dict[str, Any]:
+        """Begin a step of the calibration, or all.
+
+        Raises:
+            RefusedError: something else is at work.
+        """
+        module = [sys.executable, "-m", "station.console.live.guided"]
+        words = [str(self._config_path), step, *(["new"] if new else [])]
+        return self._begin("calibrate", step, [*module, *words])
+
+    def check(self) -> dict[str, Any]:
+        """Compare the empty booth with what was stored when it was calibrated.
+
+        Raises:
+            RefusedError: something else is at work.
+        """
+        option = ["--config", str(self._config_path)]
+        return self._begin(
+            "check", "", [sys.executable, "-m", "station.cli", "check", "--json", *option]
+        )
+
+    def answer(self, word: str) -> dict[str, Any]:
+        """What the operator says to the running task: "go", "yes" or "no".
+
+        Raises:
+            RefusedError: it waits for nothing.
+        """
+        with self._lock:
+            process = self._process
+            if process is None or process.stdin is None or not self._state["waits_for"]:
+                raise RefusedError("nothing waits for an answer")
+            self._state["waits_for"] = ""
+            process.stdin.write(f"{word}\n")
+            process.stdin.flush()
+        return self.state()
+
+    def stop(self) -> dict[str, Any]:
+        """End the running task as Ctrl-C does; what was seen is kept."""
+        with self._lock:
+            if self._process is not None:
+                self._process.send_signal(signal.SIGINT)
+        return self.state()
+
+    def close(self) -> None:
+        with self._lock:
+            if self._process is not None:
+                self._process.terminate()
+
+    def _begin(self, kind: str, step: str, command: list[str]) -> dict[str, Any]:
+        with self._lock:
+            if self._process is not None:
+                raise RefusedError(f"{self._state['kind']} is at work; wait, or stop it")
+            self._state = {**_idle(), "kind": kind, "step": step, "running": True}
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                preexec_fn=die_with_parent,
+            )
+            reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
+        reader.start()
+        self._tell()
+        return self.state()
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        for line in process.stdout:
+            try:
+                said = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(said, list):
+                self._keep_check(said)
+            elif isinstance(said, dict):
+                self._hear(said)
+        words = process.stderr.read().strip().splitlines()
+        code = process.wait()
+        with self._lock:
+            self._process = None
+            if words and code not in (0, _EXIT_MOVED):
+                self._state["error"] = words[-1].removeprefix("error: ")
+            self._state |= {"running": False, "waits_for": "", "countdown_s": None}
+        self._tell()
+
+    def _hear(self, said: dict[str, Any]) -> None:
+        """One line of the guide."""
+        text = str(said.get("text", ""))
+        with self._lock:
+            state = self._state
+            match said.get("kind"):
+                case "step":
+                    state |= {"title": said["title"], "instruction": text, "progress": ""}
+                    state["waits_for"] = "go" if said.get("waits") else ""
+                case "countdown":
+                    state["countdown_s"] = said["left_s"] or None
+                case "progress":
+                    state["progress"] = text
+                case "question":
+                    state |= {"question": text, "waits_for": "yes or no"}
+                case "line" | "done":
+                    state["lines"] = [*state["lines"], text][-_LINES_KEPT:]
+                case "error":
+                    state["error"] = text
+        self._tell()
+
+    def _keep_check(self, moves: list[Any]) -> None:
+        now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        bad = [m["camera"] for m in moves if m["moved"] or m["lost"]]
+        write_json(self._folder / CHECK_FILE, {"time": now, "moved": bad, "cameras": moves})
+
+    def _tell(self) -> None:
+        self._events.append("calibration", self.state())
+
+
+def _idle() -> dict[str, Any]:
+    return {
+        "kind": "", "step": "", "running": False, "title": "", "instruction": "", "progress": "",
+        "question": "", "waits_for": "", "countdown_s": None, "lines": [], "error": "",
+    }  # fmt: skip

@@ -1,0 +1,200 @@
+"""Watches the booth: cameras, framesets, scans, the spool; and tells the event log what changed."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import zmq
+
+from station.archive.index import ScanIndex
+from station.archive.records import PLACES, ScanRecord
+from station.console.live.control import NotRunningError, RefusedError, command
+from station.console.live.events import EventLog
+from station.core.config import BoothConfig
+from station.core.errors import BoothError
+from station.core.service import notify
+from station.core.spool import Spool
+from station.messaging.messages import CameraHealth, Request, ScanEvent
+from station.messaging.transport import subscriber
+
+_POLL_MS = 50
+_SPOOL_S = 0.1
+_STATUS_S = 1.0
+_SILENT_S = 1.3
+"""Health comes twice a second; two that are missing say that the capture process is gone."""
+_RECENT = 200
+
+
+@dataclass(slots=True)
+class CameraState:
+    """One camera as the operator sees it."""
+
+    name: str
+    state: str = "off"
+    """"off", "opening", "streaming", "lost" or "dead"."""
+    detail: str = "its capture process has not been heard of yet"
+    frames: int = 0
+    lost: int = 0
+    heard_s: float = field(default_factory=time.monotonic)
+
+    def document(self) -> dict[str, Any]:
+        return {"name": self.name, "state": self.state, "detail": self.detail,
+                "frames": self.frames, "lost": self.lost}  # fmt: skip
+
+
+class Watch:
+    """One thread; what it knows may be read from any."""
+
+    def __init__(self, config: BoothConfig, events: EventLog, log: logging.Logger) -> None:
+        self._config, self._events, self._log = config, events, log
+        self._index = ScanIndex(Spool(config.spool.folder))
+        self._cameras = {camera.name: CameraState(camera.name) for camera in config.cameras}
+        self._status: dict[str, Any] = {}
+        self._fault = ""
+        self._rate_hz: float | None = None
+        self._framesets: tuple[int, float] | None = None
+        self._seen: dict[str, str] | None = None
+        self._spool_ns: tuple[int, ...] = ()
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=run, name=name, daemon=True)
+            for name, run in (("watch", self._run), ("status", self._ask))
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(5.0)
+
+    def booth(self) -> dict[str, Any]:
+        """Everything of the booth's state that is known now."""
+        spool = self._status.get("spool", {})
+        usage = shutil.disk_usage(self._config.spool.folder)
+        return {
+            "running": not self._fault,
+            "fault": self._fault,
+            "streaming": bool(self._status.get("streaming", False)),
+            "cameras": [camera.document() for camera in self._cameras.values()],
+            "framesets_hz": self._rate_hz,
+            "spool": {place: int(spool.get(place, 0)) for place in (*PLACES, "done")},
+            "disk_free_mb": usage.free / 1e6,
+            "disk_needed_mb": self._config.spool.min_free_mb,
+        }
+
+    def _run(self) -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        sources = ["events", *(f"camera-{name}" for name in self._cameras)]
+        incoming = subscriber(context, self._config.runtime.folder, sources, ["scan", "health"])
+        looked_s = 0.0
+        while not self._stop.is_set():
+            try:
+                if incoming.poll(_POLL_MS):
+                    self._hear(*incoming.recv_multipart())
+                now_s = time.monotonic()
+                if now_s - looked_s > _SPOOL_S:
+                    looked_s = now_s
+                    self._watch_spool()
+                    self._watch_silence(now_s)
+                    notify("WATCHDOG=1")
+            except (BoothError, OSError, zmq.ZMQError) as error:
+                self._log.warning("watching the booth: %s", error)
+                self._stop.wait(1.0)
+        context.destroy(linger=0)
+
+    def _hear(self, topic: bytes, packed: bytes) -> None:
+        if topic == b"scan":
+            event = ScanEvent.unpack(packed)
+            self._events.append(
+                "scan",
+                {"scan_id": event.scan_id, "state": event.state, "framesets": event.framesets,
+                 "wanted": event.wanted, "reason": event.reason},
+            )  # fmt: skip
+            return
+        health = CameraHealth.unpack(packed)
+        camera = self._cameras.get(health.camera)
+        if camera is None:
+            return
+        changed = (camera.state, camera.detail) != (health.state, health.detail)
+        camera.state, camera.detail = health.state, health.detail
+        camera.frames, camera.lost = health.frames, health.lost
+        camera.heard_s = time.monotonic()
+        if changed:
+            self._events.append("camera", camera.document())
+
+    def _watch_silence(self, now_s: float) -> None:
+        for camera in self._cameras.values():
+            if camera.state != "dead" and now_s - camera.heard_s > _SILENT_S:
+                camera.state = "dead"
+                camera.detail = (
+                    "its capture process does not answer; it is started again by itself; if this "
+                    "stays, unplug the camera's USB for five seconds"
+                )
+                self._events.append("camera", camera.document())
+
+    def _watch_spool(self) -> None:
+        folder = self._config.spool.folder
+        changed = tuple(
+            (folder / place).stat().st_mtime_ns for place in PLACES if (folder / place).is_dir()
+        )
+        if changed == self._spool_ns and time.time_ns() - max(changed, default=0) > 1_000_000_000:
+            return
+        self._spool_ns = changed
+        found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}
+        states = {scan_id: scan.state for scan_id, scan in found.items()}
+        before, self._seen = self._seen, dict(states)
+        for scan_id, state in states.items():
+            if before is not None and before.get(scan_id) != state:
+                self._tell(found[scan_id])
+        for scan_id in (before or {}).keys() - states.keys():
+            if self._index.get(scan_id) is None:
+                self._events.append("scan", {"scan_id": scan_id, "state": "deleted"})
+
+    def _tell(self, scan: ScanRecord) -> None:
+        done = scan.state in ("delivered", "rescan", "failed")
+        document = {"scan_id": scan.scan_id, "state": scan.state, "label": scan.label,
+                    "verdict": scan.verdict, "reasons": list(scan.reasons)}  # fmt: skip
+        self._events.append("result" if done else "job", document)
+
+    def _ask(self) -> None:
+        while not self._stop.wait(_STATUS_S):
+            try:
+                self._take_status(command(self._config, Request("status")))
+                self._set_fault("")
+            except (NotRunningError, RefusedError) as error:
+                self._set_fault(str(error))
+
+    def _take_status(self, status: dict[str, Any]) -> None:
+        now_s, count = time.monotonic(), status.get("sync", {}).get("framesets")
+        changed = status.get("streaming") != self._status.get("streaming")
+        self._status = status
+        if count is None:
+            self._framesets = None
+            return
+        if self._framesets is not None and count >= self._framesets[0]:
+            before, before_s = self._framesets
+            rate_hz = round((count - before) / (now_s - before_s), 1)
+            if rate_hz != self._rate_hz or changed:
+                self._rate_hz = rate_hz
+                self._events.append(
+                    "framesets", {"rate_hz": rate_hz, "streaming": status["streaming"]}
+                )
+        self._framesets = (count, now_s)
+
+    def _set_fault(self, fault: str) -> None:
+        if fault != self._fault:
+            self._fault = fault
+            self._events.append("fault", {"fault": fault})
+
+
+def scan_document(scan: ScanRecord) -> dict[str, Any]:
+    """A record as the API shows it."""
+    return {**asdict(scan), "verdict": scan.verdict, "reasons": list(scan.reasons)}

@@ -1,0 +1,183 @@
+"""What the console must remember across restarts: sessions, tokens and keys, never in clear.
+
+A session's or token's secret is 256 random bits, so one SHA-256 hides it well; the password is a
+person's, so it is hashed with argon2id (RFC 9106) in a file of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import sqlite3
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from argon2 import PasswordHasher
+from argon2.exceptions import InvalidHashError, VerificationError
+
+from station.core.errors import BoothError
+from station.core.files import private_folder, write_bytes
+
+Scope = Literal["read", "scan", "manage"]
+SCOPES: tuple[Scope, ...] = ("read", "scan", "manage")
+"""See scans and the booth; take scans and move the sensors; delete, calibrate."""
+PASSWORD = "password"
+SHORTEST_PASSWORD = 8
+_TOKEN_PREFIX = "booth_"
+_KEYS_KEPT_S = 7 * 86_400.0
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS sessions (hash TEXT PRIMARY KEY, expires REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS tokens (
+  name TEXT PRIMARY KEY, hash TEXT UNIQUE NOT NULL, scopes TEXT NOT NULL,
+  made REAL NOT NULL, expires REAL);
+CREATE TABLE IF NOT EXISTS keys (
+  key TEXT PRIMARY KEY, request TEXT NOT NULL, answer TEXT NOT NULL, made REAL NOT NULL);
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """A program's way in."""
+
+    name: str
+    scopes: tuple[Scope, ...]
+    made: float
+    """Seconds since 1970."""
+    expires: float | None
+
+
+class Vault:
+    """The console's private folder. Safe for several threads and processes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = private_folder(folder)
+        self._hasher = PasswordHasher()
+        self._lock = threading.Lock()
+        mask = os.umask(0o177)
+        try:
+            self._database = sqlite3.connect(
+                folder / "console.sqlite", timeout=10, isolation_level=None, check_same_thread=False
+            )
+        finally:
+            os.umask(mask)
+        self._database.execute("PRAGMA journal_mode = WAL")
+        self._database.executescript(_SCHEMA)
+
+    def close(self) -> None:
+        self._database.close()
+
+    def _run(self, query: str, *values: object) -> list[tuple[object, ...]]:
+        with self._lock:
+            return self._database.execute(query, values).fetchall()
+
+    @property
+    def has_password(self) -> bool:
+        return (self._folder / PASSWORD).exists()
+
+    def set_password(self, password: str) -> None:
+        """Hash and keep the operator's password; whoever is logged in has to log in again.
+
+        Raises:
+            BoothError: it is too short.
+        """
+        if len(password) < SHORTEST_PASSWORD:
+            raise BoothError(f"the password needs {SHORTEST_PASSWORD} characters or more")
+        write_bytes(self._folder / PASSWORD, self._hasher.hash(password).encode())
+        (self._folder / PASSWORD).chmod(0o600)
+        self._run("DELETE FROM sessions")
+
+    def check_password(self, password: str) -> bool:
+        """Whether it is the operator's; takes tens of milliseconds whatever the answer."""
+        try:
+            stored = (self._folder / PASSWORD).read_text()
+            return self._hasher.verify(stored, password)
+        except (OSError, VerificationError, InvalidHashError):
+            return False
+
+    def open_session(self, hours: float) -> str:
+        """A new session's secret, for the cookie."""
+        secret = secrets.token_urlsafe(32)
+        now = time.time()
+        self._run("DELETE FROM sessions WHERE expires < ?", now)
+        self._run("INSERT INTO sessions VALUES (?, ?)", _hash(secret), now + 3600 * hours)
+        return secret
+
+    def session_holds(self, secret: str) -> bool:
+        query = "SELECT 1 FROM sessions WHERE hash = ? AND expires > ?"
+        return bool(self._run(query, _hash(secret), time.time()))
+
+    def close_session(self, secret: str) -> None:
+        self._run("DELETE FROM sessions WHERE hash = ?", _hash(secret))
+
+    def make_token(self, name: str, scopes: Iterable[Scope], days: float | None) -> str:
+        """A new token; shown once, only its hash is kept.
+
+        Raises:
+            BoothError: the name is taken.
+        """
+        secret = _TOKEN_PREFIX + secrets.token_urlsafe(32)
+        now = time.time()
+        expires = None if days is None else now + 86_400 * days
+        try:
+            self._run(
+                "INSERT INTO tokens VALUES (?, ?, ?, ?, ?)",
+                name, _hash(secret), " ".join(s for s in SCOPES if s in scopes), now, expires,
+            )  # fmt: skip
+        except sqlite3.IntegrityError:
+            raise BoothError(
+                f"there is a token {name} already; revoke it first: station token revoke {name}"
+            ) from None
+        return secret
+
+    def tokens(self) -> list[Token]:
+        rows = self._run("SELECT name, scopes, made, expires FROM tokens ORDER BY made")
+        return [_token(row) for row in rows]
+
+    def revoke_token(self, name: str) -> None:
+        """Make a token worthless, at once.
+
+        Raises:
+            BoothError: there is none of that name.
+        """
+        if not self._run("DELETE FROM tokens WHERE name = ? RETURNING name", name):
+            known = ", ".join(token.name for token in self.tokens()) or "none"
+            raise BoothError(f"there is no token {name} (there are: {known})")
+
+    def find_token(self, secret: str) -> Token | None:
+        """The token with this secret, unless it expired or was revoked."""
+        rows = self._run(
+            "SELECT name, scopes, made, expires FROM tokens WHERE hash = ? "
+            "AND (expires IS NULL OR expires > ?)",
+            _hash(secret),
+            time.time(),
+        )
+        return _token(rows[0]) if rows else None
+
+    def remember(self, key: str, request: str, answer: str) -> tuple[str, str]:
+        """Tie an idempotency key to what it began; what it was tied to first stays.
+
+        Returns:
+            (request, answer) that the key stands for.
+        """
+        now = time.time()
+        self._run("DELETE FROM keys WHERE made < ?", now - _KEYS_KEPT_S)
+        self._run("INSERT OR IGNORE INTO keys VALUES (?, ?, ?, ?)", key, request, answer, now)
+        found = self._run("SELECT request, answer FROM keys WHERE key = ?", key)[0]
+        return str(found[0]), str(found[1])
+
+
+def _token(row: tuple[object, ...]) -> Token:
+    name, scopes, made, expires = row
+    granted = tuple(scope for scope in SCOPES if scope in str(scopes).split())
+    return Token(
+        str(name), granted, float(str(made)), None if expires is None else float(str(expires))
+    )
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()

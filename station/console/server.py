@@ -1,0 +1,154 @@
+"""How the console is served: addresses, certificate, and how long a slow sender is waited for."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import socket
+import threading
+from typing import Any
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from station.console.api.console import Console
+from station.console.app import create_app
+from station.console.security.certificate import CERTIFICATE, KEY
+from station.core.config import ConsoleConfig
+from station.core.errors import BoothError, ConfigError
+from station.core.service import notify
+
+_HEAD_S = 10.0
+"""A request's head has to arrive within this; nobody holds a connection open by typing slowly."""
+_HEAD_BYTES = 16 << 10
+_MOST_CONNECTIONS = 200
+_STOP_S = 2
+
+
+class PatientProtocol(H11Protocol):
+    """uvicorn's HTTP/1.1, but a request's head has to arrive in time."""
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._head_timer: asyncio.TimerHandle | None = None
+        self._expect_head()
+
+    def data_received(self, data: bytes) -> None:
+        before = self.cycle
+        waiting = before is None or before.response_complete
+        if waiting and self._head_timer is None:
+            self._expect_head()
+        super().data_received(data)
+        if self.cycle is not before:
+            self._cancel_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._cancel_head()
+        super().connection_lost(exc)
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        self._cancel_head()
+        super().handle_websocket_upgrade(event)
+
+    def _expect_head(self) -> None:
+        self._head_timer = self.loop.call_later(_HEAD_S, self._too_slow)
+
+    def _cancel_head(self) -> None:
+        if self._head_timer is not None:
+            self._head_timer.cancel()
+            self._head_timer = None
+
+    def _too_slow(self) -> None:
+        if not self.transport.is_closing():
+            self.transport.close()
+
+
+def check_exposure(config: ConsoleConfig, has_password: bool) -> bool:
+    """Whether to speak TLS.
+
+    Raises:
+        ConfigError: beyond this machine without a password or a certificate.
+    """
+    certificate = config.folder / CERTIFICATE
+    if is_loopback(config.host):
+        return certificate.exists()
+    if not has_password:
+        raise ConfigError(
+            f"console.host is {config.host}: others could use the booth; set a password first: "
+            "station console --set-password"
+        )
+    if not certificate.exists():
+        raise ConfigError(
+            f"console.host is {config.host}: passwords and bodies would cross the network in "
+            "clear; make a certificate first: station console --make-certificate"
+        )
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is this machine's own."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
+    """Serve until told to stop.
+
+    Raises:
+        BoothError: the address cannot be listened at.
+    """
+    config = console.config.console
+    secure = check_exposure(config, console.vault.has_password)
+    listener = _listener(config.host, config.port)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(console),
+            http=PatientProtocol,
+            ws="websockets-sansio",
+            ws_max_size=1 << 10,
+            ws_max_queue=2,
+            h11_max_incomplete_event_size=_HEAD_BYTES,
+            limit_concurrency=_MOST_CONNECTIONS,
+            timeout_keep_alive=30,
+            timeout_graceful_shutdown=_STOP_S,
+            ssl_certfile=str(config.folder / CERTIFICATE) if secure else None,
+            ssl_keyfile=str(config.folder / KEY) if secure else None,
+            server_header=False,
+            access_log=False,
+            log_config=None,
+            log_level="warning",
+        )
+    )
+    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
+    threading.Thread(target=_until, args=(stop, server, console), daemon=True).start()
+    scheme = "https" if secure else "http"
+    log.info("the console is at %s://%s:%d", scheme, config.host, config.port)
+    notify("READY=1")
+    server.run(sockets=[listener])
+
+
+def _until(stop: threading.Event, server: uvicorn.Server, console: Console) -> None:
+    stop.wait()
+    console.closing.set()
+    server.should_exit = True
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as cause:
+        listener.close()
+        raise BoothError(
+            f"the console cannot listen at {host}:{port} ({cause.strerror}); choose another "
+            "console.port in booth.toml"
+        ) from None
+    listener.listen(128)
+    return listener

@@ -1,0 +1,91 @@
+"""What has been handed over to whom, and what waits: on disk, so that no restart forgets it.
+
+handover/<target>/waiting/<scan id>.json   tries, when next, what went wrong
+handover/<target>/done/<scan id>           handed over; kept as long as the result is
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from station.core.files import fsync_folder, private_folder, write_json
+
+PAUSES_S = (5.0, 15.0, 60.0, 300.0, 900.0, 3600.0)
+"""After the first, second ... failure; then every hour, for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """One result that one target has not got yet."""
+
+    target: str
+    scan_id: str
+    tries: int = 0
+    next_s: float = 0.0
+    """When to try, seconds since 1970."""
+    error: str = ""
+
+    def document(self) -> dict[str, Any]:
+        moment = datetime.fromtimestamp(self.next_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        return {"target": self.target, "scan_id": self.scan_id, "tries": self.tries,
+                "next_try": moment if self.next_s else "", "error": self.error}  # fmt: skip
+
+    def failed(self, error: str, now_s: float) -> Waiting:
+        """After one more try, with a longer pause."""
+        pause_s = PAUSES_S[min(self.tries, len(PAUSES_S) - 1)]
+        return replace(self, tries=self.tries + 1, next_s=now_s + pause_s, error=error)
+
+
+class Ledger:
+    """The folder `handover` of a spool."""
+
+    def __init__(self, spool_folder: Path) -> None:
+        self._folder = spool_folder / "handover"
+
+    def follow(self, target: str, scan_ids: Iterable[str]) -> None:
+        """Note results that are new; forget those that are gone."""
+        there = set(scan_ids)
+        done, waiting = self._place(target, "done"), self._place(target, "waiting")
+        for path in [*done.iterdir(), *waiting.glob("*.json")]:
+            if path.name.removesuffix(".json") not in there:
+                path.unlink(missing_ok=True)
+        for scan_id in there:
+            if not (done / scan_id).exists() and not (waiting / f"{scan_id}.json").exists():
+                self.keep(Waiting(target, scan_id))
+
+    def keep(self, entry: Waiting) -> None:
+        """Write down what waits."""
+        path = self._place(entry.target, "waiting") / f"{entry.scan_id}.json"
+        write_json(path, {"tries": entry.tries, "next_s": entry.next_s, "error": entry.error})
+
+    def finish(self, entry: Waiting) -> None:
+        """It has been handed over: never again."""
+        done = self._place(entry.target, "done")
+        os.close(os.open(done / entry.scan_id, os.O_CREAT | os.O_WRONLY, 0o600))
+        fsync_folder(done)
+        waiting = self._place(entry.target, "waiting")
+        (waiting / f"{entry.scan_id}.json").unlink(missing_ok=True)
+
+    def waiting(self) -> list[Waiting]:
+        """All that waits, whoever for."""
+        if not self._folder.is_dir():
+            return []
+        found = []
+        for path in sorted(self._folder.glob("*/waiting/*.json")):
+            try:
+                document = json.loads(path.read_bytes())
+                entry = Waiting(path.parent.parent.name, path.stem, int(document["tries"]),
+                                float(document["next_s"]), str(document["error"]))  # fmt: skip
+            except (OSError, ValueError, KeyError, TypeError):
+                entry = Waiting(path.parent.parent.name, path.stem)
+            found.append(entry)
+        return found
+
+    def _place(self, target: str, name: str) -> Path:
+        return private_folder(self._folder / target / name)

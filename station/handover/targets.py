@@ -1,0 +1,146 @@
+"""How one result reaches one target: copied into a folder, or announced by a signed POST."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import shutil
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, Protocol
+
+from station.archive.records import ScanRecord
+from station.archive.smis import smis
+from station.archive.tables import FILES, csv_table, read_measurements, rows
+from station.core.config import DeliverConfig
+from station.core.errors import BoothError
+from station.core.files import fsync_file, fsync_folder
+
+_TIMEOUT_S = 10.0
+_LINKS = ("mesh.glb", "mesh.obj", "preview.png", "avatar.glb")
+
+
+class HandOverError(BoothError):
+    """The target did not take the result; it is tried again."""
+
+
+class Target(Protocol):
+    """Takes a result, or raises HandOverError."""
+
+    def __call__(self, scan: ScanRecord, result: Path) -> None: ...
+
+
+def make_target(config: DeliverConfig) -> Target:
+    """The target of a section of booth.toml."""
+    if config.folder is not None:
+        return FolderTarget(config.folder)
+    assert config.url is not None
+    assert config.secret_file is not None
+    return WebhookTarget(config.name, config.url, config.secret_file, config.link)
+
+
+class FolderTarget:
+    """Copies a result beside its final name, then renames it: a reader never sees half of one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __call__(self, scan: ScanRecord, result: Path) -> None:
+        final = self._folder / scan.scan_id
+        if final.exists():
+            return
+        if not self._folder.is_dir():
+            raise HandOverError(f"{self._folder} is not there; is the share mounted?")
+        beside = self._folder / f".{scan.scan_id}.part"
+        try:
+            if beside.exists():
+                shutil.rmtree(beside)
+            shutil.copytree(result, beside)
+            document = read_measurements(result, "as-scanned")
+            (beside / "individual.smis").write_bytes(smis(scan, document))
+            for pose, name in FILES.items():
+                table = csv_table(scan, read_measurements(result, pose), "cm", "en")
+                (beside / name).with_suffix(".csv").write_text(table, encoding="utf-8", newline="")
+            for path in beside.iterdir():
+                fsync_file(path)
+            fsync_folder(beside)
+            beside.rename(final)
+            fsync_folder(self._folder)
+        except OSError as cause:
+            raise HandOverError(f"{self._folder}: {cause.strerror or cause}") from None
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """A redirected POST would carry a body's measurements to wherever the answer says."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str,
+        headers: Any, newurl: str,
+    ) -> None:  # fmt: skip
+        del req, fp, code, msg, headers, newurl
+
+
+class WebhookTarget:
+    """Posts a result's JSON with links to its files, signed.
+
+    `Booth-Signature: t=<seconds>,v1=<hex>`, v1 = HMAC-SHA256(secret, "<seconds>." + body). The
+    receiver computes it again, compares, and refuses old times. `Idempotency-Key` is the same
+    whenever the same result is posted again: the station may die between the receiver's answer
+    and writing it down.
+    """
+
+    def __init__(self, name: str, url: str, secret_file: Path, link: str) -> None:
+        self._name, self._url = name, url
+        self._secret_file, self._link = secret_file, link.rstrip("/")
+
+    def __call__(self, scan: ScanRecord, result: Path) -> None:
+        body = json.dumps(self.document(scan, result), ensure_ascii=False).encode()
+        headers = {
+            "Content-Type": "application/json",
+            "Idempotency-Key": f"{self._name}/{scan.scan_id}",
+            "Booth-Signature": self.signature(body, int(time.time())),
+        }
+        request = urllib.request.Request(self._url, body, headers, method="POST")
+        opener = urllib.request.build_opener(_NoRedirect)
+        try:
+            with opener.open(request, timeout=_TIMEOUT_S):
+                pass
+        except urllib.error.HTTPError as cause:
+            raise HandOverError(f"{self._url} answers {cause.code}") from None
+        except (OSError, ValueError) as cause:
+            reason = getattr(cause, "reason", cause)
+            raise HandOverError(f"{self._url}: {reason}") from None
+
+    def signature(self, body: bytes, seconds: int) -> str:
+        """The header's value.
+
+        Raises:
+            HandOverError: the secret cannot be read.
+        """
+        try:
+            secret = self._secret_file.read_bytes().strip()
+        except OSError as cause:
+            raise HandOverError(f"{self._secret_file}: {cause.strerror}") from None
+        mac = hmac.new(secret, f"{seconds}.".encode() + body, hashlib.sha256).hexdigest()
+        return f"t={seconds},v1={mac}"
+
+    def document(self, scan: ScanRecord, result: Path) -> Mapping[str, Any]:
+        """What is posted."""
+        at = f"{self._link}/api/v1/scans/{scan.scan_id}"
+        tables = {pose: rows(read_measurements(result, pose), "m", "en") for pose in FILES}
+        return {
+            "event": "result",
+            "scan_id": scan.scan_id,
+            "label": scan.label,
+            "booth": scan.booth,
+            "created": scan.created,
+            "verdict": scan.verdict,
+            "reasons": list(scan.reasons),
+            "unit": "m",
+            "measurements": tables,
+            "links": {name: f"{at}/files/{name}" for name in _LINKS} if self._link else {},
+        }
