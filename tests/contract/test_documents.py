@@ -34,6 +34,7 @@ LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
 CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 WRITTEN = re.compile(r"`([\w/.]+\.py)`[^`\n]*:\n\n```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 """A file that a recipe writes, and what it writes."""
+TYPED = re.compile(r"\s*(?:\$ )?(?:sudo )?((?:station|reconstruct) [a-z-].*)")
 PATH = re.compile(r"[\w.*{},@/-]+")
 DOTTED = re.compile(r"(?:station|workers)(?:\.\w+)+(?:\(\))?")
 TOP_LEVEL = ("station", "workers", "tests", "docs", "deploy", "systemd", ".ci")
@@ -56,13 +57,13 @@ def _prose(document: Path) -> str:
 
 
 def _code(document: Path) -> list[str]:
-    """What stands in backticks."""
+    """Code in backticks."""
     return [match.group(1).strip() for match in CODE.finditer(_prose(document))]
 
 
 @lru_cache
 def _anchors(document: Path) -> set[str]:
-    """Of the headings, as GitHub makes them."""
+    """Anchors of the headings, as GitHub makes them."""
     headings = re.findall(r"^#+ +(.+)$", _prose(document), re.MULTILINE)
     plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
     return {heading.strip().replace(" ", "-") for heading in plain}
@@ -165,7 +166,7 @@ def test_dotted_names_exist(document: Path) -> None:
 
 
 def _lines(document: Path) -> list[str]:
-    """What can be typed at a prompt."""
+    """Lines that can be typed at a prompt."""
     blocks = (block for language, block in _blocks(document) if language in ("", "sh"))
     return [*_code(document), *(line for block in blocks for line in block.split("\n"))]
 
@@ -188,18 +189,20 @@ def _targets() -> set[str]:
 def test_commands_and_their_options_exist(document: Path) -> None:
     # A recipe may add a command of its own.
     added = set(re.findall(r'^ *"(\w+)": \("', document.read_text(), re.MULTILINE))
-    wrong = [
-        line.strip()
-        for line in _lines(document)
-        if re.match(r"\s*(?:\$ )?(?:station|reconstruct) [a-z-]", line)
-        and line.split()[1] not in added
-        and not _is_command(line)
-    ]
-    assert wrong == []
+    typed = [found.group(1) for line in _lines(document) if (found := TYPED.match(line))]
+    assert [one for one in typed if one.split()[1] not in added and not _is_command(one)] == []
+
+
+@documents
+def test_files_in_commands_exist(document: Path) -> None:
+    words = {word for _, block in _blocks(document) for word in block.split()}
+    given = {word for word in words if PATH.fullmatch(word) and word.split("/")[0] in TOP_LEVEL}
+    paths = {path for path in given if Path(path).suffix} - set(_written(document))
+    assert {path for path in paths if not list(ROOT.glob(path))} == set()
 
 
 def _is_command(line: str) -> bool:
-    words = shlex.split(line.strip().removeprefix("$ ").partition(" #")[0].replace("...", ""))
+    words = shlex.split(line.partition(" #")[0].replace("...", ""))
     command: click.Command = PROGRAMS[words[0]]
     context = click.Context(command)
     known = {"--help", "-h"}
@@ -237,7 +240,7 @@ ARCHITECTURE = ROOT / "docs" / "architecture.md"
 
 
 def _first_cells(document: Path, heading: str) -> set[str]:
-    """What the rows of the table under a heading begin with, without backticks."""
+    """First cells of the table under a heading, without backticks."""
     section = _prose(document).partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| *`([^`|]+)` *\|", section, re.MULTILINE)
     assert rows, f"no table under {heading}"

@@ -196,7 +196,11 @@ def intervals(
 
 
 def _model_of(trace: Trace, pose: Pose) -> ErrorModel:
-    return shipped()[pose][sides_pooled(trace.definition.name)]
+    name = sides_pooled(trace.definition.name)
+    try:
+        return shipped()[pose][name]
+    except KeyError:
+        raise FormatError(f"{SHIPPED} has no row {name}; learn it with: make intervals") from None
 
 
 def content_interval(
