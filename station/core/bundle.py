@@ -50,6 +50,8 @@ class Bundle:
     scan_id: str
     created: str
     label: str
+    booth: str
+    """Name of the booth; empty where the bundle does not say."""
     depth_scale_m: float
     """Metres per unit of the depth images."""
     rig: Rig
@@ -115,6 +117,7 @@ def read_bundle(folder: Path) -> Bundle:
             scan_id=str(document["scan_id"]),
             created=str(document["created"]),
             label=str(document.get("label", "")),
+            booth=str(document.get("booth", "")),
             depth_scale_m=scale,
             rig=rig,
             frames=frames,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
+import pygltflib as gltf
 import pytest
 import trimesh
 
@@ -138,7 +140,9 @@ def test_what_is_documented_is_valid(name: str) -> None:
         ("result", {"version": 2}),
         ("result", {"status": "perhaps"}),
         ("result", {"status": "rescan"}),
-        ("result", {"reasons": ["left forearm not seen"]}),
+        ("result", {"reasons": ["the cameras saw only 5 % of the left forearm"]}),
+        ("result", {"label": 7}),
+        ("measurements", {"verdict": {"status": "perhaps", "reasons": []}}),
         ("result", {"files": {"mesh.ply": SHA}}),
         ("result", {"translation": [0.0, 0.0]}),
         ("measurements", {"pose": "sitting"}),
@@ -175,10 +179,16 @@ def test_a_bundle_follows_its_schemas(bundle: Path) -> None:
 
 
 def test_a_result_follows_its_schemas(result: Path) -> None:
-    _validator("result").validate(_read(result / "result.json"))
+    whole = _read(result / "result.json")
+    _validator("result").validate(whole)
+    origin = {key: whole[key] for key in ("scan_id", "label", "created", "booth", "calibration")}
     for path in result.glob("measurements*.json"):
         document = _read(path)
         _validator("measurements").validate(document)
+        assert list(document)[2:8] == [*origin, "verdict"]
+        assert origin.items() <= document.items()
+        assert document["verdict"]["status"] == whole["status"]
+        assert {row["basis"] for row in document["measurements"]} <= {"seen", "partly", "inferred"}
         for row in document["measurements"]:
             low, high = row["interval95_m"]
             assert low <= row["value_m"] <= high, row["name"]
@@ -216,3 +226,28 @@ def test_all_meshes_are_one_closed_body(result: Path) -> None:
         assert np.abs(upright - ply.vertices).max() < 1e-6
     cloud = trimesh.load(result / "cloud.ply")
     assert len(cloud.vertices) > 10_000
+
+
+def test_every_export_says_whose_it_is(bundle: Path, tmp_path: Path) -> None:
+    """A label is a customer's text: it stays on its line."""
+    manifest = _read(bundle / "bundle.json")
+    copy = tmp_path / "bundle"
+    shutil.copytree(bundle, copy)
+    label = "Größe 7\nend_header\u0007"
+    (copy / "bundle.json").write_text(json.dumps({**manifest, "label": label, "booth": "Nord"}))
+    out = tmp_path / "out"
+    out.mkdir()
+    reconstruct_bundle(copy, out)
+    quoted = json.dumps(label).encode()
+    for name in ("mesh.ply", "mesh.obj", "cloud.ply"):
+        lines = (out / name).read_bytes()[:2000].splitlines()
+        assert any(line.endswith(b"label " + quoted) for line in lines), name
+        assert any(
+            line.endswith(b"created " + json.dumps(manifest["created"]).encode()) for line in lines
+        )
+    for name in ("mesh.glb", "avatar.glb"):
+        extras = gltf.GLTF2().load(out / name).asset.extras
+        assert (extras["label"], extras["booth"]) == (label, "Nord")
+        assert extras["verdict"]["status"] == "ok"
+    assert _read(out / "result.json")["label"] == label
+    assert trimesh.load_mesh(out / "mesh.ply", process=False).is_watertight

@@ -15,6 +15,7 @@ from true_measurements import TrueBody
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from workers.export.meshes import obj_mesh, ply_mesh
+from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
 from workers.measure.definitions import DEFINITIONS, Route, Section
@@ -23,8 +24,11 @@ from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
 from workers.reconstruct.measure_cli import measure
+from workers.scape.fit.verdict import Verdict
 from workers.scape.learn.landmarks import find_landmarks
 from workers.scape.model.body_model import BodyModel, BodyState, load_model
+
+VERDICT = Verdict("rescan", ("the left arm is hidden",), (), ("hand_left", "forearm_left"))
 
 
 @pytest.fixture(scope="module")
@@ -262,12 +266,27 @@ def test_a_results_tables_are_printed_with_their_intervals(
         ("measurements.json", measure_body(model, model.mean, sigma)),
         ("measurements-standard.json", measure_standing(model, model.mean, state, sigma)),
     ):
-        (tmp_path / name).write_text(json.dumps(measurements_document("s1", body)))
+        document = measurements_document(Origin("s1", label="=Order 7"), body, VERDICT)
+        (tmp_path / name).write_text(json.dumps(document))
     rows = list(csv.DictReader(io.StringIO(_run(str(tmp_path), "--csv", "--pose", "standard"))))
-    assert {row["unit"] for row in rows} == {"m", "m3", "m2"}
-    assert all(float(row["low"]) < float(row["value"]) < float(row["high"]) for row in rows[:9])
+    assert [(row["name"], row["value"]) for row in rows[:4]] == [
+        ("verdict", "rescan"), ("reason", "the left arm is hidden"), ("scan_id", "s1"),
+        ("label", "'=Order 7"),
+    ]  # fmt: skip
+    numbers = [row for row in rows if row["unit"]]
+    assert {row["unit"] for row in numbers} == {"m", "m3", "m2"}
+    blank = {row["name"] for row in numbers if not row["value"]}
+    assert {"hand_length_left", "wrist_girth_left", "sleeve_length_left"} <= blank
+    assert not {"hand_length_right", "waist_girth", "height", "volume"} & blank
+    assert all(
+        float(row["low"]) < float(row["value"]) < float(row["high"])
+        for row in numbers
+        if row["value"]
+    )
     assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
-    assert "s1, pose as-scanned" in _run(str(tmp_path))
+    table = _run(str(tmp_path)).splitlines()
+    assert table[:2] == ["verdict: rescan", "reason: the left arm is hidden"]
+    assert any(line.startswith("hand_length_left") and "not measured" in line for line in table)
     both = CliRunner().invoke(measure, [str(tmp_path), "--json", "--csv"])
     assert both.exit_code == 2
     assert "not both" in both.output

@@ -99,7 +99,7 @@ def test_labels_keep_clear_of_the_body_and_of_each_other(
 
 def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]) -> None:
     good = _decoded(preview(model.mean, model.faces, rows, OK))
-    verdict = Verdict("rescan", ("left forearm not seen (12 % of it)", "x" * 1000))
+    verdict = Verdict("rescan", ("the cameras saw only 12 % of the left forearm", "x" * 1000))
     again = _decoded(preview(model.mean, model.faces, rows, verdict))
     assert (good[-30:] == BACKGROUND).all()
     assert (again[-30:] != BACKGROUND).any()

@@ -5,7 +5,8 @@ glTF is y up and metric; the world is z up, so (x, y, z) becomes (x, z, -y).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pygltflib as gltf
@@ -25,13 +26,18 @@ _INFLUENCES = 4
 """Joints that move a vertex: as many as every glTF reader takes."""
 
 
-def mesh_glb(vertices: Array, faces: Faces, measurements: Sequence[Measurement]) -> bytes:
+def mesh_glb(
+    vertices: Array,
+    faces: Faces,
+    measurements: Sequence[Measurement],
+    about: Mapping[str, Any] | None = None,
+) -> bytes:
     """The body, and each measurement's line under its name.
 
     The default scene "body" shows the surface alone; the scene "measurements" has the lines too.
-    A line's value and standard are extras of its node.
+    A line's value and standard are extras of its node; `about` are extras of the file.
     """
-    file = _File()
+    file = _File(about)
     file.scene("body", [file.node(name="body", mesh=file.body(vertices, faces))])
     lines = []
     material = file.material("line", _LINE_COLOR)
@@ -51,13 +57,15 @@ def mesh_glb(vertices: Array, faces: Faces, measurements: Sequence[Measurement])
     return file.content()
 
 
-def avatar_glb(model: BodyModel, vertices: Array, state: BodyState) -> bytes:
+def avatar_glb(
+    model: BodyModel, vertices: Array, state: BodyState, about: Mapping[str, Any] | None = None
+) -> bytes:
     """The body with a skeleton: it rests as it was scanned.
 
     A joint's rotation is that of result.json's pose, so rotations of identity stand the body in the
-    model's neutral pose.
+    model's neutral pose. `about` are extras of the file.
     """
-    file = _File()
+    file = _File(about)
     joints = joint_positions(model, vertices, state.rotations)
     skin = file.add_skin(model, joints, state)
     attributes = gltf.Attributes()
@@ -71,8 +79,9 @@ def avatar_glb(model: BodyModel, vertices: Array, state: BodyState) -> bytes:
 class _File:
     """A glTF file as it grows: arrays go into one buffer, each with its accessor."""
 
-    def __init__(self) -> None:
-        self._gltf = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="body-booth"), scene=0)
+    def __init__(self, about: Mapping[str, Any] | None = None) -> None:
+        asset = gltf.Asset(version="2.0", generator="body-booth", extras=dict(about or {}))
+        self._gltf = gltf.GLTF2(asset=asset, scene=0)
         self._blob = bytearray()
 
     def content(self) -> bytes:

@@ -1,4 +1,4 @@
-"""The result folder: everything in it, and result.json with the hash of each file."""
+"""Result folder: its files, and result.json with the hash of each."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from station import __version__
 from workers.cloud.observed import PointCloud
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
+from workers.export.origin import Origin
 from workers.export.preview import preview
 from workers.export.stopwatch import Stopwatch
-from workers.measure.body import Content, MeasuredBody
+from workers.measure.body import Content, MeasuredBody, Measurement
 from workers.scape.fit.fit import FitResult
+from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
 
 STANDARD_POSE_FILE = "measurements-standard.json"
@@ -34,11 +36,11 @@ def write_result(
     cloud: PointCloud,
     measured: MeasuredBody,
     standing: MeasuredBody,
-    scan_id: str,
+    origin: Origin,
     method: str,
     watch: Stopwatch,
 ) -> None:
-    """Write a result's files into an existing folder; publishing it is the caller's.
+    """Write a result's files into an existing folder, which the caller publishes.
 
     Args:
         measured: the body as scanned.
@@ -46,56 +48,73 @@ def write_result(
     """
     with watch.step("export"):
         faces = model.faces
-        # Drawing leaves the interpreter's lock alone: it goes on beside the other files.
+        about = {**origin.to_json(), "verdict": verdict_document(fit.verdict)}
+        comments = [*origin.comments(), f"verdict {fit.verdict.status}"]
+        # Drawing releases the interpreter's lock, so it runs beside the other files.
         with ThreadPoolExecutor(1) as beside:
+            missing = fit.verdict.missing_parts
+            rows = [row for row in measured.rows if not row.parts & missing]
             forward = -fit.state.rotations[0][:, 1]
             heading_rad = float(np.arctan2(forward[0], -forward[1]))
-            picture = beside.submit(
-                preview, fit.vertices, faces, measured.rows, fit.verdict, heading_rad
-            )
+            picture = beside.submit(preview, fit.vertices, faces, rows, fit.verdict, heading_rad)
             files = {
-                "mesh.ply": ply_mesh(fit.vertices, faces),
-                "mesh.obj": obj_mesh(fit.vertices, model),
-                "mesh.glb": mesh_glb(fit.vertices, faces, measured.rows),
-                "avatar.glb": avatar_glb(model, fit.vertices, fit.state),
-                "cloud.ply": ply_cloud(cloud.points, cloud.normals),
-                "measurements.json": _json(measurements_document(scan_id, measured)),
-                STANDARD_POSE_FILE: _json(measurements_document(scan_id, standing)),
+                "mesh.ply": ply_mesh(fit.vertices, faces, comments),
+                "mesh.obj": obj_mesh(fit.vertices, model, comments),
+                "mesh.glb": mesh_glb(fit.vertices, faces, rows, about),
+                "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
+                "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
+                "measurements.json": _json(measurements_document(origin, measured, fit.verdict)),
+                STANDARD_POSE_FILE: _json(measurements_document(origin, standing, fit.verdict)),
                 "preview.png": picture.result(),
             }
         for name, content in files.items():
             (folder / name).write_bytes(content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     seconds = {**watch.seconds, "total": watch.total_s()}
-    document = result_document(model, fit, cloud.origin_m, scan_id, method, seconds, hashes)
+    document = result_document(model, fit, cloud.origin_m, origin, method, seconds, hashes)
     (folder / "result.json").write_bytes(_json(document))
 
 
-def measurements_document(scan_id: str, measured: MeasuredBody) -> dict[str, Any]:
+def verdict_document(verdict: Verdict) -> dict[str, Any]:
+    """Verdict as it stands in the tables and in the glTF files."""
+    return {"status": verdict.status, "reasons": list(verdict.reasons)}
+
+
+def measurements_document(
+    origin: Origin, measured: MeasuredBody, verdict: Verdict | None = None
+) -> dict[str, Any]:
     """measurements.json, format "booth-measurements", version 1.
 
-    Rows are lengths. Volume and surface have units of their own and stand beside the rows.
+    Rows are lengths; volume and surface, which have other units, stand beside them. Rows on parts
+    that are missing in the scan have no value.
+
+    Args:
+        verdict: None for a mesh that was not fitted to a scan.
     """
+    missing = frozenset[str]() if verdict is None else verdict.missing_parts
 
     def content(found: Content) -> dict[str, Any]:
         return {"value": found.value, "interval95": list(found.interval95)}
 
+    def entry(row: Measurement) -> dict[str, Any]:
+        blank = bool(row.parts & missing)
+        return {
+            "name": row.name,
+            "standard": row.standard,
+            "value_m": None if blank else row.value_m,
+            "interval95_m": None if blank else list(row.interval95_m),
+            "basis": None if blank else row.basis,
+            "path": np.round(row.path, 5).tolist(),
+            "closed": row.closed,
+        }
+
     return {
         "format": "booth-measurements",
         "version": 1,
-        "scan_id": scan_id,
+        **origin.to_json(),
+        **({} if verdict is None else {"verdict": verdict_document(verdict)}),
         "pose": measured.pose,
-        "measurements": [
-            {
-                "name": row.name,
-                "standard": row.standard,
-                "value_m": row.value_m,
-                "interval95_m": list(row.interval95_m),
-                "path": np.round(row.path, 5).tolist(),
-                "closed": row.closed,
-            }
-            for row in measured.rows
-        ],
+        "measurements": [entry(row) for row in measured.rows],
         "volume_m3": content(measured.volume_m3),
         "surface_m2": content(measured.surface_m2),
     }
@@ -105,7 +124,7 @@ def result_document(
     model: BodyModel,
     fit: FitResult,
     origin_m: tuple[float, float, float],
-    scan_id: str,
+    origin: Origin,
     method: str,
     seconds: dict[str, float],
     hashes: dict[str, str],
@@ -115,7 +134,7 @@ def result_document(
     return {
         "format": "booth-result",
         "version": 1,
-        "scan_id": scan_id,
+        **origin.to_json(),
         "status": fit.verdict.status,
         "reasons": list(fit.verdict.reasons),
         "notes": list(fit.verdict.notes),
@@ -153,12 +172,12 @@ def result_document(
 
 @lru_cache(maxsize=1)
 def _library_versions() -> dict[str, str]:
-    """They cannot change while the program runs."""
+    """Versions of the libraries, which do not change while the program runs."""
     return {name: metadata.version(name) for name in _LIBRARIES}
 
 
 def _json(document: dict[str, Any]) -> bytes:
-    """An entry a line, a table's row a line: people can read it, and it is quick to write."""
+    """JSON with one line per entry and per row of a table: readable, and fast to write."""
     entries = ",\n".join(f" {_compact(key)}: {_lines(value)}" for key, value in document.items())
     return f"{{\n{entries}\n}}\n".encode()
 

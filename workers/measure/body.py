@@ -1,4 +1,4 @@
-"""Measures a body in the template's topology by the table of definitions."""
+"""Measurements of a body in the template's topology, by the table of definitions."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.measure.coverage import Basis, basis_of
 from workers.measure.intervals import Pose, content_interval, intervals, row_values
 from workers.measure.standing import stood_upright
-from workers.measure.tracing import trace_all
+from workers.measure.tracing import Trace, trace_all
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import signed_volume, triangle_areas
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """One value with the line that was measured."""
+    """Value of one row, with the line that was measured."""
 
     name: str
     standard: str
@@ -27,6 +29,10 @@ class Measurement:
     path: Array
     """(n, 3) on the mesh as scanned, world frame, whatever the pose that the value is for."""
     closed: bool
+    basis: Basis
+    """Whether cameras saw the line."""
+    parts: frozenset[str]
+    """Parts of the body that the line or its landmarks lie on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +45,7 @@ class Content:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredBody:
-    """Everything that is measured of a body in one pose."""
+    """All measurements of a body in one pose."""
 
     pose: Pose
     rows: tuple[Measurement, ...]
@@ -48,23 +54,31 @@ class MeasuredBody:
 
 
 def measure_body(
-    model: BodyModel, vertices: Array, vertex_sigma_m: Array | None = None
+    model: BodyModel,
+    vertices: Array,
+    vertex_sigma_m: Array | None = None,
+    vertex_seen: Mask | None = None,
 ) -> MeasuredBody:
     """All measurements of a body as it stands.
 
     Args:
         vertices: (P, 3) in the template's topology, z up, floor at 0, metres.
-        vertex_sigma_m: (P,) the fit's posterior standard deviation along the normals. Without it
-            the mesh itself counts as the truth and intervals have no width.
+        vertex_sigma_m: (P,), the fit's posterior standard deviation along the normals. Without it
+            the mesh counts as exact and intervals have no width.
+        vertex_seen: (P,), vertices that cameras saw. Without it all count as seen.
 
     Raises:
         InputError: a plane misses the part of the body that it should cut.
     """
-    return _measured(model, vertices, vertices, "as-scanned", vertex_sigma_m)
+    return _measured(model, vertices, vertices, "as-scanned", vertex_sigma_m, vertex_seen)
 
 
 def measure_standing(
-    model: BodyModel, vertices: Array, state: BodyState, vertex_sigma_m: Array | None = None
+    model: BodyModel,
+    vertices: Array,
+    state: BodyState,
+    vertex_sigma_m: Array | None = None,
+    vertex_seen: Mask | None = None,
 ) -> MeasuredBody:
     """All measurements of a body in the standard standing pose; their lines lie on the mesh as it
     was scanned.
@@ -72,14 +86,19 @@ def measure_standing(
     Args:
         vertices: (P, 3) as scanned.
         state: the parameters that the vertices were fitted with.
-        vertex_sigma_m: as in `measure_body`.
+        vertex_sigma_m, vertex_seen: as in `measure_body`.
     """
     standing = stood_upright(model, vertices, state)
-    return _measured(model, standing, vertices, "standard", vertex_sigma_m)
+    return _measured(model, standing, vertices, "standard", vertex_sigma_m, vertex_seen)
 
 
 def _measured(
-    model: BodyModel, vertices: Array, shown: Array, pose: Pose, vertex_sigma_m: Array | None
+    model: BodyModel,
+    vertices: Array,
+    shown: Array,
+    pose: Pose,
+    vertex_sigma_m: Array | None,
+    vertex_seen: Mask | None,
 ) -> MeasuredBody:
     traces = trace_all(model, vertices)
     values = row_values(traces, pose)
@@ -91,6 +110,8 @@ def _measured(
             interval,
             trace.path(shown),
             trace.closed,
+            basis_of(trace, vertices, vertex_seen),
+            _parts_of(model, trace),
         )
         for trace, value, interval in zip(
             traces, values, intervals(traces, values, vertex_sigma_m, pose), strict=True
@@ -104,3 +125,9 @@ def _measured(
         Content(volume, content_interval("volume", volume, vertex_sigma_m, pose)),
         Content(surface, content_interval("surface", surface, vertex_sigma_m, pose)),
     )
+
+
+def _parts_of(model: BodyModel, trace: Trace) -> frozenset[str]:
+    landmarks = [model.landmarks[name] for name in trace.definition.landmarks]
+    vertices = np.concatenate([trace.points.tail, np.array(landmarks, np.intp)])
+    return frozenset(model.part_names[part] for part in np.unique(model.part_of_vertex[vertices]))

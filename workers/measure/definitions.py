@@ -33,6 +33,11 @@ class Level:
     towards: tuple[str, ...] = ()
     share: float = 0.0
 
+    @property
+    def named(self) -> tuple[str, ...]:
+        """All landmarks of the plane."""
+        return (*self.landmarks, *self.towards)
+
 
 @dataclass(frozen=True, slots=True)
 class Square:
@@ -48,6 +53,12 @@ class Square:
     at: str | None = None
     beyond: str | None = None
 
+    @property
+    def named(self) -> tuple[str, ...]:
+        """All landmarks of the plane."""
+        more = (name for name in (self.at, self.beyond) if name is not None)
+        return (self.start, self.end, *more)
+
 
 @dataclass(frozen=True, slots=True)
 class Tilted:
@@ -57,6 +68,11 @@ class Tilted:
     back: str
     side: str
     other_side: str
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """All landmarks of the plane."""
+        return (self.front, self.back, self.side, self.other_side)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +125,19 @@ class Definition:
     quantity: Quantity
     way: Section | Route | Top | Drop
     standard: str = ""
+
+    @property
+    def landmarks(self) -> tuple[str, ...]:
+        """Landmarks that the row depends on."""
+        match self.way:
+            case Section(plane, _, _, across):
+                return (*plane.named, *(across or ()))
+            case Route(landmarks):
+                return landmarks
+            case Top():
+                return ()
+            case Drop(upper, lower):
+                return (upper, lower)
 
 
 TRUNK = ("pelvis", "abdomen", "chest")

@@ -1,4 +1,4 @@
-"""One scan, bundle to result, readable as the paper's steps.
+"""Reconstruction of one scan, from the bundle to the result folder, in the paper's steps.
 
 Zhou, Pan, Tong, Liu & Pan, "Fast 3D Human Body Reconstruction from Kinects" (2013): merge and
 filter the depth images, fit the SCAPE model to them, measure the body.
@@ -19,6 +19,7 @@ from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.cloud.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
+from workers.export.origin import Origin
 from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.export.stopwatch import Stopwatch
@@ -43,7 +44,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class JobSummary:
-    """What an operator has to know of a result."""
+    """Verdict of a result for the operator."""
 
     status: str
     """"ok" or "rescan"."""
@@ -51,7 +52,7 @@ class JobSummary:
 
 
 def warm_up() -> BodyModel:
-    """Load everything that the first job would otherwise wait for."""
+    """Load and compile everything that the first job needs."""
     model = load_model()
     compile_preprocessing()
     cloud = _mean_cloud(model)
@@ -66,7 +67,7 @@ def warm_up() -> BodyModel:
 
 
 def _mean_cloud(model: BodyModel) -> PointCloud:
-    """The mean body as a scanner would give it."""
+    """Cloud of the mean body's vertices."""
     count = model.vertex_count
     return PointCloud(
         model.mean,
@@ -100,7 +101,9 @@ def reconstruct_bundle(
     progress("filtering", 0.0)
     with watch.step("preprocess"):
         scan = preprocess(bundle, volume)
-    return _fitted(model, scan, bundle.scan_id, method, out_folder, watch, progress, observer)
+    return _fitted(
+        model, scan, Origin.of_bundle(bundle), method, out_folder, watch, progress, observer
+    )
 
 
 def reconstruct_cloud(
@@ -119,42 +122,42 @@ def reconstruct_cloud(
         model = model or load_model()
     with watch.step("preprocess"):
         scan = Preprocessed(cloud, (), ())
-    return _fitted(model, scan, scan_id, method, out_folder, watch, progress, observer)
+    return _fitted(model, scan, Origin(scan_id), method, out_folder, watch, progress, observer)
 
 
 def _fitted(
     model: BodyModel,
     scan: Preprocessed,
-    scan_id: str,
+    origin: Origin,
     method: Method,
     out_folder: Path,
     watch: Stopwatch,
     progress: Progress,
     observer: Observer,
 ) -> JobSummary:
-    """Fit, measure, write."""
+    """Fit, measure and write."""
     with single_threaded_blas():
-        laid = fit_overlapping(model, scan, method, progress, observer)
+        overlapping = fit_overlapping(model, scan, method, progress, observer)
         progress("measuring", 0.0)
-        # Neither needs what the other finds.
+        # Measuring and separating limbs do not depend on each other.
         with ThreadPoolExecutor(1) as beside:
-            measuring = beside.submit(_measured, model, laid, watch)
-            fit = separate_limbs(model, laid, scan.findings, observer)
+            measuring = beside.submit(_measured, model, overlapping, watch)
+            fit = separate_limbs(model, overlapping, scan.findings, observer)
             measured, standing = measuring.result()
         watch.seconds.update(fit.seconds)
         progress("writing", 0.0)
-        write_result(out_folder, model, fit, fit.cloud, measured, standing, scan_id, method, watch)
+        write_result(out_folder, model, fit, fit.cloud, measured, standing, origin, method, watch)
     progress("done", 1.0)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)
 
 
 def _measured(
-    model: BodyModel, laid: OverlappingFit, watch: Stopwatch
+    model: BodyModel, fit: OverlappingFit, watch: Stopwatch
 ) -> tuple[MeasuredBody, MeasuredBody]:
-    """As scanned, and in the standard standing pose."""
+    """Measurements as scanned, and in the standard standing pose."""
     with watch.step("measure"):
-        sigma_m = laid.surface.sigma_m
+        sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
         return (
-            measure_body(model, laid.vertices, sigma_m),
-            measure_standing(model, laid.vertices, laid.state, sigma_m),
+            measure_body(model, fit.vertices, sigma_m, seen),
+            measure_standing(model, fit.vertices, fit.state, sigma_m, seen),
         )

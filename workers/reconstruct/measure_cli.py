@@ -1,4 +1,4 @@
-"""`reconstruct measure`: the table of a result, or of a mesh in the template's topology."""
+"""`reconstruct measure`: table of a result, or of a mesh in the template's topology."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import click
 from station.core.errors import FormatError, InputError
 
 _DIGITS = 5
-"""Of a table: hundredths of a millimetre, far below any interval."""
+"""Decimals in tables: hundredths of a millimetre, far below any interval."""
+_BLANK = "not measured"
 
 
 @click.command()
@@ -74,6 +75,7 @@ def _of_result(folder: Path, pose: str) -> dict[str, Any]:
 
 def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
     from workers.cloud.bare import read_template_mesh
+    from workers.export.origin import Origin
     from workers.export.result import measurements_document
     from workers.measure.body import measure_body, measure_standing
     from workers.scape.model.body_model import load_model
@@ -81,9 +83,9 @@ def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
     model = load_model()
     vertices = read_template_mesh(path, model.faces, up)
     if pose == "as-scanned":
-        return measurements_document(path.stem, measure_body(model, vertices))
+        return measurements_document(Origin(path.stem), measure_body(model, vertices))
     state = model.project(vertices)
-    return measurements_document(path.stem, measure_standing(model, vertices, state))
+    return measurements_document(Origin(path.stem), measure_standing(model, vertices, state))
 
 
 def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
@@ -94,33 +96,57 @@ def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]
     ]
 
 
+def _heading(document: dict[str, Any]) -> list[tuple[str, str]]:
+    """What is said before any number: the verdict with its reasons, then the scan."""
+    verdict = document.get("verdict", {})
+    lines = [("verdict", verdict["status"])] if verdict else []
+    lines += [("reason", reason) for reason in verdict.get("reasons", ())]
+    keys = ("scan_id", "label", "created", "booth", "calibration", "pose")
+    return lines + [(key, document[key]) for key in keys if document.get(key)]
+
+
 def _write_csv(document: dict[str, Any]) -> None:
     writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(["name", "value", "low", "high", "unit", "standard"])
+    writer.writerow(["name", "value", "low", "high", "unit", "basis", "standard"])
+    for name, text in _heading(document):
+        writer.writerow([name, _plain(text), "", "", "", "", ""])
     for row in document["measurements"]:
-        numbers = (round(number, _DIGITS) for number in (row["value_m"], *row["interval95_m"]))
-        writer.writerow([row["name"], *numbers, "m", row["standard"]])
+        numbers: tuple[float | str, ...] = ("", "", "")
+        if row["value_m"] is not None:
+            numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
+        writer.writerow([row["name"], *numbers, "m", row.get("basis") or "", row["standard"]])
     for name, unit, content in _contents(document):
-        numbers = (round(number, _DIGITS) for number in (content["value"], *content["interval95"]))
-        writer.writerow([name, *numbers, unit, ""])
+        numbers = tuple(round(x, _DIGITS) for x in (content["value"], *content["interval95"]))
+        writer.writerow([name, *numbers, unit, "", ""])
+
+
+def _plain(text: str) -> str:
+    """Text on one line that no spreadsheet takes for a formula."""
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
 
 
 def _print_table(document: dict[str, Any]) -> None:
     from workers.measure.definitions import DEFINITIONS
 
     words = {definition.name: definition.words for definition in DEFINITIONS}
-    click.echo(f"{document['scan_id']}, pose {document['pose']}: values with 95 % intervals")
+    for name, text in _heading(document):
+        click.echo(f"{name.replace('_', ' ')}: {_plain(text)}")
+    click.echo("Values with 95 % intervals:")
     for row in document["measurements"]:
+        tail = f"{words.get(row['name'], '')}{_in_brackets(row['standard'])}"
+        if row["value_m"] is None:
+            click.echo(f"{row['name']:<31}{_BLANK:>14}{'':<26}{tail}")
+            continue
         low, high = row["interval95_m"]
         span = f"{100 * low:6.1f} to {100 * high:5.1f}" if high > low else ""
-        click.echo(
-            f"{row['name']:<27}{100 * row['value_m']:7.1f} cm  {span:<16}"
-            f"{words.get(row['name'], '')}{_in_brackets(row['standard'])}"
-        )
+        basis = row.get("basis", "")
+        basis = "" if basis == "seen" else basis
+        click.echo(f"{row['name']:<31}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}")
     for name, unit, content in _contents(document):
         low, high = content["interval95"]
         span = f"{low:6.4f} to {high:6.4f}" if high > low else ""
-        click.echo(f"{name:<27}{content['value']:7.4f} {unit}  {span}")
+        click.echo(f"{name:<31}{content['value']:7.4f} {unit}  {span}")
 
 
 def _in_brackets(standard: str) -> str:

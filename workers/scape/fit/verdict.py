@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +68,19 @@ class Verdict:
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
     """Remarks on the booth that do not touch this scan."""
+    missing: tuple[str, ...] = ()
+    """Parts that were not seen or that do not match the scan: nothing can be measured there. A hand
+    stands for its thumb and fingers."""
+
+    @property
+    def missing_parts(self) -> frozenset[str]:
+        """Names of the model's parts that are missing."""
+        names = set(self.missing)
+        for part in self.missing:
+            stem, _, side = part.rpartition("_")
+            if stem == "hand":
+                names.update(f"{member}_{side}" for member in HAND)
+        return frozenset(names)
 
 
 def report_parts(
@@ -143,7 +156,7 @@ def judge(
     parts: Sequence[PartReport],
     sides: dict[str, float],
     findings: Sequence[Finding],
-    lost: Sequence[str],
+    lost: Mapping[str, str],
     stature_m: float,
     beta: Array,
     camera_shifts_m: dict[str, float],
@@ -153,12 +166,12 @@ def judge(
     Args:
         sides: shares of the trunk's front and back that were seen.
         findings: what preprocessing noticed; each is a reason.
-        lost: what `lost_parts` says.
+        lost: what `lost_parts` gives.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
     """
     reasons = [finding.message for finding in findings]
-    reasons += lost
+    reasons += list(lost.values())[:_PARTS_NAMED]
     low, high = _STATURES_M
     if not low < stature_m < high:
         reasons.append(
@@ -170,8 +183,12 @@ def judge(
     for side, share in sides.items():
         if share < _LEAST_COVERAGE:
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
+    missing = [name for name in lost if name]
     for part in parts:
-        reasons += _part_reasons(part)
+        found = _part_reasons(part)
+        reasons += found
+        if found:
+            missing.append(part.name)
     noticed, unusable = _CAMERA_SHIFTS_M
     notes: list[str] = []
     for camera, shift in camera_shifts_m.items():
@@ -180,11 +197,11 @@ def judge(
                 f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
                 "run: station check"
             )
-    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes))
+    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(missing))
 
 
-def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> list[str]:
-    """Reasons, in words, for each part of the body that a large patch of the scan belongs to."""
+def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
+    """Reasons by part of the body that a large patch of the scan belongs to; "" for none of them."""
     keys = {index: key for key, members in _groups(model).items() for index in members}
     reasons: dict[str, str] = {}
     for patch in patches:
@@ -199,13 +216,13 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> list[str]:
             )
             continue
         for index in patch.parts:
-            words = part_in_words(keys[index])
+            part = keys[index]
             reasons.setdefault(
-                words,
-                f"the {words} does not match the scan ({size} of it lie "
+                part,
+                f"the {part_in_words(part)} does not match the scan ({size} of it lie "
                 f"{1e3 * patch.distance_m:.0f} mm away)",
             )
-    return list(reasons.values())[:_PARTS_NAMED]
+    return reasons
 
 
 def _part_reasons(part: PartReport) -> list[str]:
