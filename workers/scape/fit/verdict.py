@@ -201,7 +201,7 @@ def judge(
 
 
 def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
-    """Reasons by part of the body that a large patch of the scan belongs to; "" for none of them."""
+    """Reasons by the part that a large patch of the scan belongs to; "" where it is none."""
     keys = {index: key for key, members in _groups(model).items() for index in members}
     reasons: dict[str, str] = {}
     for patch in patches:
