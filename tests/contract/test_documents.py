@@ -63,10 +63,12 @@ def _code(document: Path) -> list[str]:
 
 @lru_cache
 def _anchors(document: Path) -> set[str]:
-    """Anchors of the headings, as GitHub makes them."""
-    headings = re.findall(r"^#+ +(.+)$", _prose(document), re.MULTILINE)
-    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
-    return {heading.strip().replace(" ", "-") for heading in plain}
+    return {_slug(heading) for heading in re.findall(r"^#+ +(.+)$", _prose(document), re.MULTILINE)}
+
+
+def _slug(heading: str) -> str:
+    """Anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
 @lru_cache
@@ -312,3 +314,15 @@ def _reached(arrows: dict[str, set[str]]) -> dict[str, set[str]]:
         return seen
 
     return {node: after(node) for node in arrows}
+
+
+def test_the_code_names_documents_and_headings_that_exist() -> None:
+    """Docstrings point to derivations as: docs/mathematics.md, "Joints"."""
+    pointer = re.compile(r'(docs/\w+\.md)(?:,\s+"([^"]+)")?')
+    missing = []
+    for path in (p for folder in ("station", "workers") for p in (ROOT / folder).rglob("*.py")):
+        for name, heading in pointer.findall(path.read_text()):
+            document = ROOT / name
+            if not document.exists() or (heading and _slug(heading) not in _anchors(document)):
+                missing.append(f"{path.relative_to(ROOT)}: {name} {heading}")
+    assert missing == []

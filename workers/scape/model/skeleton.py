@@ -1,14 +1,9 @@
-"""Where the parts of a body turn against each other: joints that follow from the model itself.
+"""Joints of a body, derived from the model: no bones are learned, and none have to be stored.
 
-The vertices are those whose edges come nearest to sum_p w_kp R_p e_k, so the body is a sum of one
-field a part: Y = sum_p V_p, where V_p solves for the edges w_kp e_k alone. When everything beyond a
-joint turns by D, the fields of those parts turn, the others stay: Y' = outside + D inside. Where
-the turning parts own all edges, `outside` is the same vector c for all vertices, and
-Y' = c + D (Y - c): c is the joint. No bones are learned, and none have to be carried.
-
-The pose-dependent deformation moves what lies beyond a joint as well: by u_m for a radian about
-axis m. The joint that does the same in least squares over the three axes, u_m = -e_m x d, lies
-d = 1/2 sum_m e_m x u_m farther on.
+The body is a sum of one field a part, Y = sum_p V_p. Where everything beyond a joint turns by D,
+the other fields add up to one vector c there, so that Y' = c + D (Y - c): c is the joint. The
+pose-dependent deformation moves it by 1/2 sum_m e_m x u_m, with u_m its effect for a radian about
+axis m. Derivation: docs/mathematics.md, "Joints".
 """
 
 from __future__ import annotations
