@@ -11,15 +11,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.measure.definitions import (
-    DEFINITIONS,
+from workers.measure.definitions import DEFINITIONS
+from workers.measure.kinds import (
     Definition,
     Drop,
+    Foremost,
     Level,
+    Plane,
     Route,
     Section,
     Square,
-    Tilted,
     Top,
 )
 from workers.scape.model.body_model import BodyModel
@@ -85,7 +86,7 @@ class TrueBody:
             across = np.cross(normal, across)
         return float(np.ptp(points @ across))
 
-    def _plane(self, plane: Level | Square | Tilted) -> tuple[Array, Array]:
+    def _plane(self, plane: Plane) -> tuple[Array, Array]:
         at = self._at
         if isinstance(plane, Level):
             start = sum(at[name] for name in plane.landmarks) / len(plane.landmarks)
@@ -93,6 +94,15 @@ class TrueBody:
                 end = sum(at[name] for name in plane.towards) / len(plane.towards)
                 start = (1.0 - plane.share) * start + plane.share * end
             return start, np.array([0.0, 0.0, 1.0])
+        if isinstance(plane, Foremost):
+            heights = [float(self._plane(level)[0][2]) for level in (plane.lower, plane.upper)]
+            ahead = (at[plane.front] - at[plane.back]) * (1.0, 1.0, 0.0)
+            best = max(
+                (float(place @ ahead), tuple(place))
+                for place, part in zip(self._v, self._part, strict=True)
+                if part in plane.parts and heights[0] <= place[2] <= heights[1]
+            )
+            return np.array(best[1]), np.array([0.0, 0.0, 1.0])
         if isinstance(plane, Square):
             line = at[plane.end] - at[plane.start]
             share = plane.share

@@ -18,8 +18,11 @@ from workers.export.meshes import obj_mesh, ply_mesh
 from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
-from workers.measure.definitions import DEFINITIONS, Route, Section
+from workers.measure.coverage import basis_of
+from workers.measure.definitions import DEFINITIONS
+from workers.measure.differences import side_differences
 from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
+from workers.measure.kinds import Route, Section
 from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
@@ -235,6 +238,54 @@ def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
     flat = model.mean * (1.0, 1.0, 0.0)
     with pytest.raises(InputError, match="cannot be measured"):
         trace_all(model, flat)
+
+
+def test_a_row_says_whether_cameras_saw_its_line(model: BodyModel) -> None:
+    """The front alone: what runs along the front is seen, the back's is the model's."""
+    seen = model.mean[:, 1] < model.mean[model.landmarks["waist_side_left"], 1]
+    basis = {trace.definition.name: basis_of(trace, model.mean, seen)
+             for trace in trace_all(model, model.mean)}  # fmt: skip
+    assert basis["across_front_skin_width"] == basis["crotch_length_front"] == "seen"
+    assert basis["waist_girth"] == basis["belly_girth"] == "partly"
+    assert basis["crotch_length_back"] == basis["across_back_skin_width"] == "inferred"
+    assert {row.basis for row in measure_body(model, model.mean).rows} == {"seen"}
+
+
+def test_differences_are_left_minus_right(model: BodyModel) -> None:
+    taller = model.mean.copy()
+    arm = [model.part_names.index(part) for part in ("forearm_left", "hand_left")]
+    inside = np.isin(model.part_of_vertex, arm)
+    middle = taller[inside].mean(axis=0)
+    taller[inside] = middle + 1.05 * (taller[inside] - middle)
+    rows = measure_body(model, taller, np.full(model.vertex_count, 1e-3)).rows
+    by_name = {row.name: row for row in rows}
+    found = {row.name: row for row in side_differences(rows)}
+    assert "knee_girth" in found
+    assert not {"waist_girth", "height"} & set(found)
+    forearm, knee = found["forearm_girth"], found["knee_girth"]
+    left, right = by_name["forearm_girth_left"], by_name["forearm_girth_right"]
+    assert forearm.value_m == pytest.approx(left.value_m - right.value_m)
+    assert 0.008 < forearm.value_m < 0.02
+    assert abs(knee.value_m) < 1e-3
+    for row in (forearm, knee):
+        low, high = row.interval95_m
+        assert low < row.value_m < high
+        assert high - low < 0.08
+
+
+def test_the_belly_is_measured_where_it_protrudes(model: BodyModel) -> None:
+    """Whichever way the person stands."""
+    body = model.mean.copy()
+    navel = np.array([0.0, body[model.landmarks["waist_front"], 1], 0.99])
+    away = np.linalg.norm(body - navel, axis=1)
+    trunk = np.isin(model.part_of_vertex, [0, 1])
+    body[:, 1] -= 0.06 * np.exp(-((away / 0.08) ** 2)) * trunk
+    for turn_rad in (0.0, 1.2):
+        turned = body @ so3_exp([0.0, 0.0, turn_rad]).T
+        path = next(row.path for row in measure_body(model, turned).rows
+                    if row.name == "belly_girth")  # fmt: skip
+        assert np.ptp(path[:, 2]) < 1e-9
+        assert path[0, 2] == pytest.approx(0.99, abs=0.02)
 
 
 def _run(*words: str) -> str:

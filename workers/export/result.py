@@ -21,6 +21,7 @@ from workers.export.origin import Origin
 from workers.export.preview import preview
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import Content, MeasuredBody, Measurement
+from workers.measure.differences import side_differences
 from workers.scape.fit.fit import FitResult
 from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
@@ -115,6 +116,14 @@ def measurements_document(
         **({} if verdict is None else {"verdict": verdict_document(verdict)}),
         "pose": measured.pose,
         "measurements": [entry(row) for row in measured.rows],
+        "differences": [
+            {
+                "name": found.name,
+                "value_m": found.value_m,
+                "interval95_m": list(found.interval95_m),
+            }
+            for found in side_differences([r for r in measured.rows if not r.parts & missing])
+        ],
         "volume_m3": content(measured.volume_m3),
         "surface_m2": content(measured.surface_m2),
     }

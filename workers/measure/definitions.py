@@ -1,144 +1,26 @@
-"""The table of measurements: what each one is, in words and for the program.
+"""Table of measurements: the definition of each row, in words and for the program.
 
-Landmarks are vertices of the template (workers.scape.learn.landmarks), parts are its parts, so a
-definition is made once and every fit carries it. Clauses are given where public sources name
-them: ISO 8559-1:2017 for clothing, ISO 7250-1:2017 for the body; a row that follows a standard
-whose clause number could not be confirmed names the standard alone, any other row names none.
+Landmarks are vertices of the template (workers.scape.learn.landmarks) and parts are its parts, so a
+definition is made once and applies to every fit. Clauses of ISO 8559-1:2017 (clothing) and ISO
+7250-1:2017 (body) are given where public sources name them: the contents of ISO 8559-1 in its free
+preview, and measuring guides that quote its clauses. A row that follows a standard whose clause
+could not be confirmed names the standard alone; a row that differs from its standard names none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
-Quantity = Literal[
-    "large girth", "girth", "height", "length", "distance", "breadth", "depth", "drop"
-]
-"""What a row is; ISO 20685-1 sets its limits by this."""
-
-Leg = Literal["skin", "tape", "straight", "floor"]
-"""How a route goes on: along the skin; along the skin but taut over hollows; straight through the
-air; straight down to the floor, which ends the route.
-
-Skin and tape run in the plane that holds both ends and the mean of their normals, on the side that
-the normals point to; what the plane cuts farther from the straight line than a tenth of its length
-below it or 0.45 of its length above it is another part of the body."""
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """A horizontal plane: at the mean height of some landmarks, or between two such heights."""
-
-    landmarks: tuple[str, ...]
-    towards: tuple[str, ...] = ()
-    share: float = 0.0
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """All landmarks of the plane."""
-        return (*self.landmarks, *self.towards)
-
-
-@dataclass(frozen=True, slots=True)
-class Square:
-    """A plane square to the line between two landmarks: through `at`, or at a share of the line.
-
-    A share's plane lies at least 2 cm farther along than the landmark `beyond`: no tape goes round
-    an arm above the armpit, however low that is.
-    """
-
-    start: str
-    end: str
-    share: float = 0.0
-    at: str | None = None
-    beyond: str | None = None
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """All landmarks of the plane."""
-        more = (name for name in (self.at, self.beyond) if name is not None)
-        return (self.start, self.end, *more)
-
-
-@dataclass(frozen=True, slots=True)
-class Tilted:
-    """A plane through the line of two landmarks, parallel to the line of two others."""
-
-    front: str
-    back: str
-    side: str
-    other_side: str
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """All landmarks of the plane."""
-        return (self.front, self.back, self.side, self.other_side)
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """A girth, or the breadth or depth of one: where a plane cuts some parts of the body.
-
-    A tape spans hollows, so its way is the convex hull of the section. Of a section that falls
-    apart, `whole` takes every piece (a trunk with both thighs), otherwise the one nearest to the
-    plane's landmarks counts (one thigh of two). `across` names what breadth runs along, projected
-    to the plane; depth is square to it.
-    """
-
-    plane: Level | Square | Tilted
-    parts: tuple[str, ...]
-    whole: bool = False
-    across: tuple[str, str] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Route:
-    """From landmark to landmark, over parts of the body."""
-
-    landmarks: tuple[str, ...]
-    legs: tuple[Leg, ...]
-    parts: tuple[str, ...] = ()
-    closed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Top:
-    """The highest point of a part above the floor."""
-
-    part: str
-
-
-@dataclass(frozen=True, slots=True)
-class Drop:
-    """How much lower one landmark is than another; 0 if it is not."""
-
-    upper: str
-    lower: str
-
-
-@dataclass(frozen=True, slots=True)
-class Definition:
-    """One measurement."""
-
-    name: str
-    words: str
-    quantity: Quantity
-    way: Section | Route | Top | Drop
-    standard: str = ""
-
-    @property
-    def landmarks(self) -> tuple[str, ...]:
-        """Landmarks that the row depends on."""
-        match self.way:
-            case Section(plane, _, _, across):
-                return (*plane.named, *(across or ()))
-            case Route(landmarks):
-                return landmarks
-            case Top():
-                return ()
-            case Drop(upper, lower):
-                return (upper, lower)
-
+from workers.measure.kinds import (
+    Definition,
+    Drop,
+    Foremost,
+    Leg,
+    Level,
+    Route,
+    Section,
+    Square,
+    Tilted,
+    Top,
+)
 
 TRUNK = ("pelvis", "abdomen", "chest")
 HIPS = (*TRUNK, "thigh_left", "thigh_right")
@@ -146,7 +28,7 @@ SHOULDERS = (
     "neck", "chest", "shoulder_left", "shoulder_right", "upper_arm_left", "upper_arm_right",
 )  # fmt: skip
 YOKE = tuple(part for part in SHOULDERS if part != "neck")
-"""What lies below the seventh neck vertebra: a neck that leans to one side is not in the way."""
+"""Parts below the seventh neck vertebra, without a neck that may lean to one side."""
 FLANK = (*HIPS, "shin_left", "shin_right")
 
 _CLOTHES = "ISO 8559-1:2017"
@@ -155,6 +37,11 @@ _BUST = ("bust_left", "bust_right")
 _UNDERBUST = ("underbust_left", "underbust_right")
 _WAIST = ("waist_front", "waist_back", "waist_side_left", "waist_side_right")
 _BUTTOCKS = ("buttock_left", "buttock_right")
+_ARMPITS = ("armpit_left", "armpit_right")
+_BELLY = Foremost(
+    Level(_WAIST, _UNDERBUST, 0.5), Level(_BUTTOCKS), "waist_front", "waist_back",
+    ("pelvis", "abdomen"),
+)  # fmt: skip
 
 
 def _both(name: str) -> tuple[str, str]:
@@ -218,12 +105,35 @@ def _trunk_girths() -> tuple[Definition, ...]:
             Section(chest, TRUNK, whole=True), f"{_CLOTHES} 5.3.4",
         ),
         Definition(
+            "high_bust_girth", "level, below the armpits and above the bust", "large girth",
+            Section(Level(_ARMPITS, _BUST, 0.3), TRUNK, whole=True), f"{_CLOTHES} 5.3.6",
+        ),
+        Definition(
             "underbust_girth", "level, in the fold below the bust", "large girth",
             Section(Level(_UNDERBUST), TRUNK, whole=True), f"{_CLOTHES} 5.3.8",
         ),
         Definition(
             "waist_girth", "level, at the natural waist between ribs and hip bones", "large girth",
             Section(waist, TRUNK, whole=True), f"{_CLOTHES} 5.3.10",
+        ),
+        Definition(
+            "trouser_waist_girth",
+            "level, a quarter of the way from waist to hip, where trousers are worn", "large girth",
+            Section(Level(_WAIST, _BUTTOCKS, 0.25), HIPS, whole=True),
+        ),
+        Definition(
+            "belly_girth", "level, where the belly protrudes farthest", "large girth",
+            Section(_BELLY, HIPS, whole=True),
+        ),
+        Definition(
+            "trunk_girth",
+            "side of the neck over bust point and waist, between the legs, up the back, right side",
+            "large girth",
+            Route(
+                ("side_neck_right", "bust_right", "waist_front", "crotch", "waist_back"),
+                ("tape", "tape", "tape", "tape", "tape"), (*TRUNK, *SHOULDERS), closed=True,
+            ),
+            _CLOTHES,
         ),
         Definition(
             "high_hip_girth", "level, midway from waist to hip", "large girth",
@@ -283,6 +193,32 @@ def _trunk_lengths() -> tuple[Definition, ...]:
         Definition(
             "front_waist_length", "pit of the neck to the waist, along the front", "length",
             Route(("suprasternale", "waist_front"), ("tape",), ("neck", *TRUNK)),
+            f"{_CLOTHES} 5.4.8",
+        ),
+        Definition(
+            "across_back_skin_width", "between the back folds of the armpits, along the skin",
+            "length", Route(_both("armpit_back"), ("tape",), YOKE), _CLOTHES,
+        ),
+        Definition(
+            "across_front_skin_width", "between the front folds of the armpits, along the skin",
+            "length", Route(_both("armpit_front"), ("tape",), YOKE), f"{_CLOTHES} 5.4.7",
+        ),
+        Definition(
+            "body_rise", "right side of the waist above the crotch, vertical", "drop",
+            Drop("waist_side_right", "crotch"),
+        ),
+        Definition(
+            "crotch_length", "front of the waist, between the legs, to the back of the waist",
+            "length",
+            Route(("waist_front", "crotch", "waist_back"), ("tape", "tape"), TRUNK), _CLOTHES,
+        ),
+        Definition(
+            "crotch_length_front", "front of the waist to the crotch", "length",
+            Route(("waist_front", "crotch"), ("tape",), TRUNK), _CLOTHES,
+        ),
+        Definition(
+            "crotch_length_back", "crotch to the back of the waist", "length",
+            Route(("crotch", "waist_back"), ("tape",), TRUNK), _CLOTHES,
         ),
         _distance("head_length", "brow to the back of the head, straight",
                   ("glabella", "occiput"), _BODY),
@@ -335,6 +271,41 @@ def _arm(side: str) -> tuple[Definition, ...]:
             Drop(f"side_neck_{side}", acromion),
         ),
         Definition(
+            f"armscye_girth_{side}",
+            "shoulder point, both folds of the armpit, below the armpit and round", "girth",
+            Route(
+                (acromion, f"armpit_front_{side}", f"armpit_{side}", f"armpit_back_{side}"),
+                ("tape", "straight", "straight", "tape"),
+                ("chest", f"shoulder_{side}", f"upper_arm_{side}"), closed=True,
+            ),
+            f"{_CLOTHES} 5.3.15",
+        ),
+        Definition(
+            f"armscye_depth_{side}", "seventh neck vertebra above the armpit, vertical", "drop",
+            Drop("cervicale", f"armpit_{side}"),
+        ),
+        Definition(
+            f"hand_girth_{side}",
+            "around the hand without the thumb, a quarter of the way from knuckles to wrist",
+            "girth",
+            Section(Square(wrist, f"knuckle_{side}", 0.75), (f"hand_{side}", f"fingers_{side}")),
+            _CLOTHES,
+        ),
+        Definition(
+            f"neck_shoulder_to_waist_front_{side}",
+            "side of the neck over the bust point to the front of the waist", "length",
+            Route(
+                (f"side_neck_{side}", f"bust_{side}", "waist_front"), ("tape", "tape"),
+                (*TRUNK, *SHOULDERS),
+            ),
+            _CLOTHES,
+        ),
+        Definition(
+            f"neck_shoulder_to_waist_back_{side}",
+            "side of the neck to the back of the waist", "length",
+            Route((f"side_neck_{side}", "waist_back"), ("tape",), (*TRUNK, *SHOULDERS)), _CLOTHES,
+        ),
+        Definition(
             f"neck_to_bust_length_{side}", "side of the neck to the bust point", "length",
             Route((f"side_neck_{side}", f"bust_{side}"), ("tape",), SHOULDERS), _CLOTHES,
         ),
@@ -371,6 +342,10 @@ def _leg(side: str) -> tuple[Definition, ...]:
             "waist at the side over the hip, then straight down to the floor", "length",
             Route((f"waist_side_{side}", f"hip_side_{side}"), ("tape", "floor"), FLANK), _CLOTHES,
         ),
+        Definition(
+            f"waist_to_hip_length_{side}", "waist to hip at the side, over the skin", "length",
+            Route((f"waist_side_{side}", f"hip_side_{side}"), ("tape",), FLANK), _CLOTHES,
+        ),
         _distance(f"lower_leg_length_{side}", "kneecap's middle to the ankle's bone",
                   (knee, ankle)),
         _distance(f"foot_length_{side}", "heel to the longest toe", (heel, f"toe_{side}"), _BODY),
@@ -388,4 +363,4 @@ DEFINITIONS: tuple[Definition, ...] = (
     *_leg("left"),
     *_leg("right"),
 )
-"""All rows, in the order in which they are printed."""
+"""All rows in the order of the table."""

@@ -1,4 +1,4 @@
-"""Follows the definitions over a body in the template's topology: each row's line and value."""
+"""Lines and values of all rows on a body in the template's topology."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.errors import InputError
-from workers.measure.definitions import (
-    DEFINITIONS,
+from workers.measure.definitions import DEFINITIONS
+from workers.measure.kinds import (
     Definition,
     Drop,
+    Foremost,
     Level,
+    Plane,
     Route,
     Section,
     Square,
@@ -35,22 +37,22 @@ from workers.scape.model.deformation import vertex_normals
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
-"""How far `Square.beyond` keeps a plane from a landmark."""
+"""Distance between a plane and the landmark `Square.beyond`, at the least."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """The line of one measurement."""
+    """Line and value of one row."""
 
     definition: Definition
     value_m: float
     points: EdgePoints
     closed: bool
     to_floor: bool
-    """The line goes on from its last point straight down to the floor."""
+    """Whether the line continues from its last point straight down to the floor."""
 
     def path(self, vertices: Array) -> Array:
-        """The line (n, 3) on a body (P, 3) of the same topology."""
+        """Line (n, 3) on a body (P, 3) of the same topology."""
         found = self.points.on(vertices)
         if self.to_floor:
             found = np.concatenate([found, found[-1:] * (1.0, 1.0, 0.0)])
@@ -58,7 +60,7 @@ class Trace:
 
 
 def trace_all(model: BodyModel, vertices: Array) -> list[Trace]:
-    """Every row of the table on a body (P, 3), z up, the floor at 0.
+    """All rows of the table on a body (P, 3), z up, floor at 0.
 
     Raises:
         InputError: a plane misses the part of the body that it should cut.
@@ -118,8 +120,8 @@ class _Tracer:
     def _mean(self, landmarks: tuple[str, ...]) -> Array:
         return np.mean([self._at(landmark) for landmark in landmarks], axis=0)
 
-    def _plane(self, plane: Level | Square | Tilted) -> tuple[Array, Array]:
-        """A point of a plane, near what it is to cut, and its normal."""
+    def _plane(self, plane: Plane) -> tuple[Array, Array]:
+        """Point of a plane, near the part that it cuts, and its normal."""
         match plane:
             case Level(landmarks, towards, share):
                 point = self._mean(landmarks)
@@ -140,9 +142,24 @@ class _Tracer:
                     self._at(other) - self._at(side), self._at(back) - self._at(front)
                 )
                 return self._at(front), normal / np.linalg.norm(normal)
+            case Foremost(upper, lower, front, back, parts):
+                return self._foremost(
+                    self._plane(upper)[0][2], self._plane(lower)[0][2],
+                    self._at(front) - self._at(back), parts,
+                ), _UP  # fmt: skip
+
+    def _foremost(self, high: float, low: float, ahead: Array, parts: tuple[str, ...]) -> Array:
+        """Vertex of some parts that is farthest ahead among those between two heights."""
+        names = [self._model.part_names.index(part) for part in parts]
+        height = self._vertices[:, 2]
+        inside = np.isin(self._model.part_of_vertex, names) & (low <= height) & (height <= high)
+        candidates = self._vertices[inside]
+        if not len(candidates):
+            raise ValueError("no vertex lies between the two levels")
+        return np.asarray(candidates[np.argmax(candidates[:, :2] @ ahead[:2])])
 
     def _cut(self, section: Section) -> tuple[EdgePoints, Array]:
-        """The tape's points of a section and where they are; breadths share it with their girth."""
+        """Points of the tape around a section and their positions; kept for breadth and depth."""
         key = Section(section.plane, section.parts, section.whole)
         if key not in self._cuts:
             point, normal = self._plane(section.plane)

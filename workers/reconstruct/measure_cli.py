@@ -115,6 +115,9 @@ def _write_csv(document: dict[str, Any]) -> None:
         if row["value_m"] is not None:
             numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
         writer.writerow([row["name"], *numbers, "m", row.get("basis") or "", row["standard"]])
+    for row in document.get("differences", ()):
+        numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
+        writer.writerow([f"{row['name']}_left_minus_right", *numbers, "m", "", ""])
     for name, unit, content in _contents(document):
         numbers = tuple(round(x, _DIGITS) for x in (content["value"], *content["interval95"]))
         writer.writerow([name, *numbers, unit, "", ""])
@@ -143,10 +146,24 @@ def _print_table(document: dict[str, Any]) -> None:
         basis = row.get("basis", "")
         basis = "" if basis == "seen" else basis
         click.echo(f"{row['name']:<31}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}")
+    _print_differences(document)
     for name, unit, content in _contents(document):
         low, high = content["interval95"]
         span = f"{low:6.4f} to {high:6.4f}" if high > low else ""
         click.echo(f"{name:<31}{content['value']:7.4f} {unit}  {span}")
+
+
+def _print_differences(document: dict[str, Any]) -> None:
+    """Differences between the sides whose interval does not contain 0."""
+    for row in document.get("differences", ()):
+        low, high = row["interval95_m"]
+        if low < high and (low > 0.0 or high < 0.0):
+            side = "left" if row["value_m"] > 0.0 else "right"
+            size, ends = abs(row["value_m"]), sorted((abs(low), abs(high)))
+            click.echo(
+                f"{row['name']:<31}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
+                f"{100 * ends[1]:5.1f}    larger on the {side}"
+            )
 
 
 def _in_brackets(standard: str) -> str:
