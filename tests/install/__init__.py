@@ -1,0 +1,1 @@
+"""The package installed on a machine of its own: `make test-install`."""

@@ -1,0 +1,264 @@
+"""What a technician, a power cut and an upgrade do to a booth, on a machine of its own.
+
+The tests are one story, in order: each goes on where the one before it ended. Times are printed
+against their bars; a slow machine fails none of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from install.machine import Machine
+
+STATE = "/var/lib/booth"
+RECORDINGS = f"{STATE}/recordings"
+_DELIVERED = (0, 3)
+"""`station scan`: a result, or a result that says to scan again."""
+_RESTART_BAR_S, _BOOT_BAR_S, _FIRST_SCAN_BAR_S, _SIZE_BAR_MB = 3.0, 15.0, 120.0, 250.0
+_EXPOSURE_BAR = 1.5
+
+
+def _report(what: str, value: float, bar: float, unit: str = "s") -> None:
+    word = "met" if value <= bar else "missed"
+    print(f"  {what:<44} {value:8.1f} {unit:<3} bar {bar:g} {unit}: {word}")
+
+
+def _until(true: Callable[[], bool], what: str, limit_s: float = 90.0) -> float:
+    """Wait; returns how long it took."""
+    began_s = time.monotonic()
+    while not true():
+        assert time.monotonic() - began_s < limit_s, f"{what}: not within {limit_s:g} s"
+        time.sleep(0.05)
+    return time.monotonic() - began_s
+
+
+def _services(machine: Machine) -> list[str]:
+    options = ("--plain", "--no-legend", "--type=service", "--state=running")
+    listed = machine.run("systemctl", "list-units", *options, "booth-*")
+    return [line.split()[0] for line in listed.stdout.splitlines()]
+
+
+def _shown(machine: Machine, unit: str) -> dict[str, str]:
+    keys = "MainPID,NRestarts,ActiveState,SubState,WatchdogUSec"
+    shown = machine.run("systemctl", "show", "-p", keys, unit).stdout
+    return dict(line.split("=", 1) for line in shown.splitlines())
+
+
+def _is_back(machine: Machine, unit: str, restarts: int) -> bool:
+    shown = _shown(machine, unit)
+    return int(shown["NRestarts"]) > restarts and shown["SubState"] == "running"
+
+
+def _scan(machine: Machine, label: str) -> str:
+    """Scan and wait for the result; returns the scan's id."""
+    done = machine.run("station", "scan", "--label", label, check=False)
+    assert done.returncode in _DELIVERED, done.stdout + done.stderr
+    found = re.search(r"^scan (\S+)", done.stdout, re.MULTILINE)
+    assert found, done.stdout
+    return found[1]
+
+
+def _outbox(machine: Machine) -> set[str]:
+    folder = machine.root / STATE.lstrip("/") / "spool/outbox"
+    return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+
+
+def _accepted(machine: Machine) -> set[str]:
+    """Scans that the station has accepted, wherever they are by now."""
+    spool = machine.root / STATE.lstrip("/") / "spool"
+    states = ("queue", "work", "outbox", "failed")
+    return {path.name for state in states for path in (spool / state).iterdir()}
+
+
+def _ready(machine: Machine) -> None:
+    """The sensors run and every camera gives frames."""
+    _until(lambda: machine.run("station", "status", check=False).returncode == 0, "control answers")
+    machine.run("station", "start", "--timeout", "60")
+
+
+def _kept(machine: Machine) -> dict[str, bytes]:
+    """What an upgrade must not touch: configuration, calibration, results."""
+    state = machine.root / STATE.lstrip("/")
+    found = [machine.root / "etc/booth/booth.toml", state / "calibration.json"]
+    found += [path for path in (state / "spool/outbox").rglob("*") if path.is_file()]
+    return {str(path): path.read_bytes() for path in found}
+
+
+@pytest.fixture(scope="module")
+def untouched(machine: Machine) -> set[str]:
+    """What is on the disk before anything is installed."""
+    return machine.files()
+
+
+def test_three_commands_lead_to_the_first_scan(
+    machine: Machine, untouched: set[str], package: Path, recordings: Path
+) -> None:
+    assert "usr/bin/station" not in untouched
+    machine.put(package, f"/root/{package.name}")
+    began_s = time.monotonic()
+    machine.run("apt-get", "install", "-y", f"/root/{package.name}")
+    installed_s = time.monotonic() - began_s
+    machine.put(recordings, RECORDINGS, owner="booth:")
+    began_s = time.monotonic()
+    setup = machine.run("station", "setup", "--recordings", RECORDINGS)
+    assert "ready: station scan" in setup.stdout
+    _scan(machine, "first")
+    seconds = installed_s + time.monotonic() - began_s
+    print()
+    _report("from apt install to the first scan", seconds, _FIRST_SCAN_BAR_S)
+    size = machine.run("dpkg-query", "-W", "-f", "${Installed-Size}", "body-booth").stdout
+    _report("installed size", int(size) / 1000, _SIZE_BAR_MB, "MB")
+
+
+def test_setup_again_changes_nothing(machine: Machine) -> None:
+    before = _kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)}
+    assert ", kept" in machine.run("station", "setup").stdout
+    assert before == (_kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)})
+
+
+def test_systemd_finds_nothing_wrong_with_the_installed_units(machine: Machine) -> None:
+    units = machine.run("sh", "-c", "cd /usr/lib/systemd/system; ls -d booth*.* opt-booth*")
+    names = [name.replace("@.", "@front-lower.") for name in units.stdout.split()]
+    names = [name for name in names if not name.endswith(".d")]
+    verified = machine.run("systemd-analyze", "verify", *names)
+    assert verified.stdout + verified.stderr == ""
+    services = [name for name in names if name.endswith(".service")]
+    print()
+    for unit in services:
+        words = machine.run("systemd-analyze", "--no-pager", "security", unit).stdout
+        found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", words)
+        assert found, words
+        _report(f"exposure of {unit}", float(found[1]), _EXPOSURE_BAR, "")
+        assert float(found[1]) <= _EXPOSURE_BAR
+
+
+def test_manuals_and_completion_are_there(machine: Machine) -> None:
+    for page in ("station", "reconstruct", "booth-setup"):
+        assert "station" in machine.run("man", "--pager=cat", page).stdout
+    completed = machine.run(
+        "env", "_STATION_COMPLETE=bash_complete", "COMP_WORDS=station sc", "COMP_CWORD=1", "station"
+    )
+    assert "scan" in completed.stdout
+
+
+def test_a_killed_process_comes_back(machine: Machine) -> None:
+    print()
+    for unit in _services(machine):
+        restarts = int(_shown(machine, unit)["NRestarts"])
+        machine.run("systemctl", "kill", "-s", "KILL", "--kill-whom=main", unit)
+        seconds = _until(lambda u=unit, n=restarts: _is_back(machine, u, n), unit)  # type: ignore[misc]
+        _report(f"{unit} back after kill -9", seconds, _RESTART_BAR_S)
+    _ready(machine)
+    _scan(machine, "after kill -9")
+
+
+def test_a_process_that_hangs_is_started_anew(machine: Machine) -> None:
+    """SIGSTOP to all at once; each has its own watchdog."""
+    units = _services(machine)
+    before = {unit: _shown(machine, unit) for unit in units}
+    began_s = time.monotonic()
+    for unit in units:
+        machine.run("systemctl", "kill", "-s", "STOP", "--kill-whom=main", unit)
+    print()
+    for unit in units:
+        restarts = int(before[unit]["NRestarts"])
+        _until(lambda u=unit, n=restarts: _is_back(machine, u, n), unit)  # type: ignore[misc]
+        watchdog_s = float(before[unit]["WatchdogUSec"].removesuffix("s"))
+        seconds = time.monotonic() - began_s
+        _report(f"{unit} back after SIGSTOP", seconds, 2 * watchdog_s + _RESTART_BAR_S)
+    _ready(machine)
+    _scan(machine, "after SIGSTOP")
+
+
+@pytest.mark.parametrize("moment", ["capturing", "reconstructing"])
+def test_a_reset_loses_no_accepted_scan(machine: Machine, moment: str) -> None:
+    """Whatever was accepted is delivered after the boot, and nothing half-written is."""
+    before = _outbox(machine)
+    scan = machine.begin("station", "scan", "--label", f"reset while {moment}")
+    if moment == "capturing":
+        time.sleep(0.4)
+    else:
+        work = machine.root / STATE.lstrip("/") / "spool/work"
+        _until(lambda: any(work.iterdir()), "a worker claims the scan")
+    machine.reset()
+    scan.wait(timeout=10)
+    accepted = _accepted(machine)
+    assert moment == "capturing" or accepted - before
+    began_s = time.monotonic()
+    machine.boot()
+    _ready(machine)
+    print()
+    _report("from power on to ready to scan", time.monotonic() - began_s, _BOOT_BAR_S)
+    _until(lambda: accepted <= _outbox(machine), "accepted scans are delivered")
+    for scan_id in _outbox(machine):
+        folder = machine.root / STATE.lstrip("/") / "spool/outbox" / scan_id
+        assert json.loads((folder / "result.json").read_text())["scan_id"] == scan_id
+    _scan(machine, "after a reset")
+
+
+def test_upgrade_and_downgrade_keep_what_the_shop_has(
+    machine: Machine, package: Path, package_before: Path
+) -> None:
+    before = _kept(machine)
+    for step in (package_before, package):
+        machine.put(step, f"/root/{step.name}")
+        machine.run("apt-get", "install", "-y", "--allow-downgrades", f"/root/{step.name}")
+        _ready(machine)
+        assert _kept(machine) == before
+    _scan(machine, "after an upgrade")
+
+
+def test_an_unknown_layout_is_refused_and_the_booth_goes_on(
+    machine: Machine, package_before: Path
+) -> None:
+    """An older package once would have met files that it cannot read."""
+    state = machine.root / STATE.lstrip("/") / "state.json"
+    known = state.read_text()
+    state.write_text('{"format": "booth-state", "version": 99}\n')
+    install = ("apt-get", "install", "-y", "--allow-downgrades", f"/root/{package_before.name}")
+    refused = machine.run(*install, check=False)
+    state.write_text(known)
+    assert refused.returncode != 0
+    assert "has version 99" in refused.stdout + refused.stderr
+    _ready(machine)
+    _scan(machine, "after a refused downgrade")
+
+
+def test_a_backup_makes_another_machine_the_same_booth(
+    machine: Machine, base: Path, package: Path, tmp_path: Path, recordings: Path
+) -> None:
+    machine.run("systemctl", "stop", "booth.target")
+    machine.run("station", "backup", "/root/usb", "--with-scans")
+    machine.run("systemctl", "start", "booth.target")
+    other = Machine(base, tmp_path / "other")
+    try:
+        other.boot()
+        other.put(package, f"/root/{package.name}")
+        other.run("apt-get", "install", "-y", f"/root/{package.name}")
+        other.put(recordings, RECORDINGS, owner="booth:")
+        other.put(machine.root / "root/usb", "/root/usb")
+        (saved,) = (other.root / "root/usb").iterdir()
+        other.run("station", "restore", f"/root/usb/{saved.name}")
+        assert "ready: station scan" in other.run("station", "setup").stdout
+        assert _outbox(other) == _outbox(machine)
+        _scan(other, "on the other machine")
+    finally:
+        other.close()
+
+
+def test_purge_leaves_nothing(machine: Machine, untouched: set[str]) -> None:
+    machine.run("apt-get", "purge", "-y", "body-booth")
+    left = {
+        path
+        for path in machine.files() - untouched
+        if not path.startswith(("root", "var/lib/dpkg", "var/cache/debconf", "var/cache/man"))
+    }
+    assert {path for path in left if not path.endswith(("-", ".old", ".pyc"))} == set()
+    assert machine.run("id", "booth", check=False).returncode != 0
+    assert machine.run("losetup", "-a").stdout.count("body-booth") == 0
