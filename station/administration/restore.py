@@ -47,8 +47,8 @@ def restore(backup: Path, config_path: Path | None) -> None:
     others = [part(name, path, config) for name in names if name != "booth.toml"]
     for one in others:
         bring_back(backup, one)
-    give_to_booth([one.place for one in others if not one.name.startswith("etc/")])
     if path == CONFIG:
+        give_to_booth([STATE_FOLDER, config.spool.folder])
         _protect(path.parent)
         migrate(STATE_FOLDER)
     click.echo(f"{backup.name} is back: {', '.join(names)}")
