@@ -40,13 +40,13 @@ sys.exit(main())
 """
 _SQUASHFS = ("-comp", "zstd", "-Xcompression-level", "9", "-all-root", "-noappend", "-no-xattrs")
 _COMPRESSION = ("-Zxz", "-z0", "--threads-max=1")
-"""Of the Debian package; what is large in it is compressed already."""
+"""Compression of the Debian package: none, its large part is compressed already."""
 _MOUNT_UNIT = "opt-booth.simulation.mount"
 
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """What is built, and when it was made."""
+    """The commit that is built, and its time."""
 
     name: str
     seconds: int
@@ -115,7 +115,7 @@ def build_booth(commit: Commit, source: Path, wheel: Path, tree: Path, out: Path
 
 
 def build_simulation(commit: Commit, source: Path, tree: Path, out: Path) -> Path:
-    """What the virtual booth and bare point clouds need besides: open3d and what it imports."""
+    """The package that virtual booths and bare point clouds need: open3d and what it imports."""
     root = tree.with_suffix(".image")
     lock = tree.with_suffix(".txt")
     lock.write_text(_difference(source / "deploy/lock/simulation.txt", source / "deploy/lock"))

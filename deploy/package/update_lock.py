@@ -11,7 +11,7 @@ FOLDER = ROOT / "deploy" / "lock"
 PYTHON = "3.11"
 """Debian 12's, which the package runs on."""
 BUILD = "build>=1.2\nsetuptools>=77\nwheel>=0.45\n"
-"""What turns the source into a wheel and a source distribution."""
+"""Packages that turn the source into a wheel and a source distribution."""
 
 
 def main() -> None:

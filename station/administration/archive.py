@@ -1,4 +1,4 @@
-"""What a backup holds, and how it is written and read: a folder with a manifest of checksums."""
+"""Backups: their parts, and a folder with a manifest of checksums that is written and read."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def parts(config_path: Path, config: BoothConfig) -> list[Part]:
 
 
 def part(name: str, config_path: Path, config: BoothConfig) -> Part:
-    """Where a part of a backup belongs in the booth that is configured.
+    """Find the place of a backup's part in the booth that is configured.
 
     Raises:
         FormatError: no backup has such a part.
@@ -77,7 +77,7 @@ def part(name: str, config_path: Path, config: BoothConfig) -> Part:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What lies in a folder, without names that begin with a dot and without scratch."""
+    """List a folder without names that begin with a dot and without scratch."""
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     return [path for path in found if path.name[0] != "." and path.name not in _SCRATCH]
 

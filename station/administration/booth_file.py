@@ -14,7 +14,7 @@ USUAL_NAMES = ("front-lower", "front-upper", "back-lower", "back-upper")
 CONFIG = Path("/etc/booth/booth.toml")
 STATE_FOLDER = Path("/var/lib/booth")
 RUNTIME_FOLDER = Path("/run/booth")
-"""Where an installed booth keeps things; the units name the same places."""
+"""Places of an installed booth; the units name the same ones."""
 
 
 def name_cameras(serials: Sequence[str], given: Sequence[str]) -> list[FreenectCamera]:

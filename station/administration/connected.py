@@ -1,4 +1,4 @@
-"""Which Kinects are connected, and to which USB controller each."""
+"""Connected Kinects, and the USB controller of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose files an administrator writes: root's commands leave them to the booth's user."""
+"""Ownership of files: what root's commands write is left to the booth's user."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from install.machine import Machine, base_root
 ROOT = Path(__file__).parents[2]
 BODY = ROOT / "station/simulation/bodies/ann.npz"
 _WORK = Path(os.environ.get("BOOTH_TEST_INSTALL", ROOT / "build/test-install"))
-"""Where roots, packages and recordings are kept between two calls."""
+"""Folder in which roots, packages and recordings are kept between two calls."""
 
 
 def _package(commit: str) -> Path:

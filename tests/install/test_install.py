@@ -1,4 +1,4 @@
-"""What a technician, a power cut and an upgrade do to a booth, on a machine of its own.
+"""A booth on a machine of its own, and what technicians, power cuts and upgrades do to it.
 
 The tests are one story, in order: each goes on where the one before it ended. Times are printed
 against their bars; a slow machine fails none of them.
@@ -83,7 +83,7 @@ def _ready(machine: Machine) -> None:
 
 
 def _kept(machine: Machine) -> dict[str, bytes]:
-    """What an upgrade must not touch: configuration, calibration, results."""
+    """Read what an upgrade must not touch: configuration, calibration, results."""
     state = machine.root / STATE.lstrip("/")
     found = [machine.root / "etc/booth/booth.toml", state / "calibration.json"]
     found += [path for path in (state / "spool/outbox").rglob("*") if path.is_file()]
@@ -92,7 +92,7 @@ def _kept(machine: Machine) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def untouched(machine: Machine) -> set[str]:
-    """What is on the disk before anything is installed."""
+    """List the disk before anything is installed."""
     return machine.files()
 
 

@@ -170,7 +170,7 @@ def test_a_backup_appears_whole_or_not_at_all(booth: Path, tmp_path: Path) -> No
 
 
 def test_every_file_of_a_booth_belongs_to_a_part(booth: Path) -> None:
-    """What a later version adds to the spool must not be forgotten by a backup."""
+    """A backup must not forget what a later version adds to the spool."""
     names = {part.name for part in parts(booth, load_config(booth))}
     assert names == {
         "booth.toml",
