@@ -11,7 +11,7 @@ from station.core.config import Volume
 from station.core.rig import CameraCalibration
 
 STRIDE_PX = 2
-_NEAR_M, _FAR_M = 0.8, 4.0
+_NEAR_M, _FAR_M = 1.0, 3.4
 _FLOOR_M = 0.05
 """Lower than this a person's outline runs into the floor's noise."""
 _SMALLEST_PERSON_PX = 400

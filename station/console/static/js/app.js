@@ -1,0 +1,104 @@
+// The page's frame: who is logged in, which view is shown, whether the console answers.
+
+import { get, remove } from './api.js';
+import { h, icon, notice } from './dom.js';
+import { connect, disconnect, listen } from './events.js';
+import { currentLanguage, loadWords, setLanguage, t } from './i18n.js';
+import { login } from './login.js';
+import { loadSettings } from './settings.js';
+
+const VIEWS = {
+  booth: () => import('./booth.js').then((module) => module.booth),
+  scan: () => import('./scan.js').then((module) => module.scan),
+  history: () => import('./history.js').then((module) => module.history),
+  calibration: () => import('./calibration.js').then((module) => module.calibration),
+  result: () => import('./result.js').then((module) => module.result),
+  compare: () => import('./compare.js').then((module) => module.compare),
+};
+const RAIL = ['scan', 'booth', 'history', 'calibration'];
+const BELONGS = { result: 'history', compare: 'history' };
+
+const main = document.getElementById('main');
+const rail = document.getElementById('rail');
+let session = null;
+let leave = () => {};
+let turn = 0;
+
+function drawRail() {
+  rail.setAttribute('aria-label', t('nav.main'));
+  rail.hidden = false;
+  const languages = h('select', { id: 'language', 'aria-label': t('nav.language'), onchange: (event) => {
+    setLanguage(event.target.value);
+    location.reload();
+  } }, h('option', { value: 'en' }, 'English'), h('option', { value: 'zh' }, '简体中文'));
+  languages.value = currentLanguage();
+  rail.replaceChildren(
+    ...RAIL.map((name) => h('a', { href: `#/${name}`, 'data-view': name }, icon(name), h('span', {}, t(`nav.${name}`)))),
+    h('span', { className: 'spacer' }),
+    h('a', { href: '/person', target: '_blank', rel: 'noopener' }, icon('person'), h('span', {}, t('nav.person'))),
+    languages,
+    session.password_set ? h('button', { id: 'logout', onclick: logOut }, t('nav.logout')) : '');
+}
+
+async function logOut() {
+  await remove('/session').catch(() => {});
+  location.reload();
+}
+
+async function show() {
+  const [, name = 'scan', ...rest] = location.hash.split('/');
+  const view = VIEWS[name] ? name : 'scan';
+  const mine = ++turn;
+  leave();
+  leave = () => {};
+  for (const link of rail.querySelectorAll('[data-view]')) {
+    if (link.dataset.view === (BELONGS[view] ?? view)) link.setAttribute('aria-current', 'page');
+    else link.removeAttribute('aria-current');
+  }
+  document.title = `${t(`${view === 'calibration' ? 'cal' : view}.title`)} – ${t('app.title')}`;
+  try {
+    const draw = await VIEWS[view]();
+    const left = await draw(main, session, ...rest.map(decodeURIComponent));
+    if (mine === turn) leave = left; else left();
+  } catch (error) {
+    if (mine !== turn || error.kind === 'not-logged-in') return;
+    main.replaceChildren(h('div', { className: 'empty' }, h('h1', {}, t('error')), h('p', { role: 'alert' }, error.message)));
+  }
+}
+
+function enter(found) {
+  session = found;
+  loadSettings(session);
+  drawRail();
+  connect();
+  show();
+}
+
+function leaveForLogin() {
+  turn += 1;
+  leave();
+  leave = () => {};
+  disconnect();
+  rail.hidden = true;
+  session = null;
+  login(main, enter);
+}
+
+let lostNotice = null;
+listen((kind) => {
+  if (kind === 'lost' && !lostNotice) {
+    lostNotice = h('div', { className: 'notice bad', id: 'lost' }, t('lost'));
+    document.getElementById('notices').append(lostNotice);
+  } else if (kind === 'back' && lostNotice) {
+    lostNotice.remove();
+    lostNotice = null;
+    notice(t('back'));
+  }
+});
+window.addEventListener('hashchange', show);
+window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
+
+const found = await get('/session');
+await loadWords(found.language);
+document.getElementById('skip').textContent = t('app.skip');
+if (found.logged_in) enter(found); else leaveForLogin();

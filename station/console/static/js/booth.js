@@ -1,0 +1,105 @@
+// The booth: what the cameras see, what is wrong and what to do.
+
+import { get, post, freshKey } from './api.js';
+import { Cameras } from './cameras.js';
+import { h, notice } from './dom.js';
+import { listen } from './events.js';
+import { t, time } from './i18n.js';
+
+const REFRESH_MS = 5000;
+
+export async function booth(main) {
+  let state = await get('/booth');
+  const cameras = new Cameras(state.cameras.map((camera) => camera.name));
+  const power = h('button', { id: 'power', onclick: () => switchSensors() });
+  const facts = h('dl', { className: 'facts' });
+  const banner = h('div', { className: 'banner', role: 'alert', hidden: true });
+  const checkText = h('p', { className: 'small' });
+  const checkButton = h('button', { id: 'check', onclick: () => check() }, t('booth.checkNow'));
+  const deliveries = h('div', { className: 'card', hidden: true });
+
+  async function switchSensors() {
+    power.disabled = true;
+    try {
+      await post(state.streaming ? '/booth/stop' : '/booth/start');
+    } catch (error) { notice(error.message, true); }
+    await refresh();
+    power.disabled = false;
+  }
+
+  async function check() {
+    checkButton.disabled = true;
+    checkText.textContent = t('booth.checking');
+    try {
+      await post('/booth/check', {}, { 'Idempotency-Key': freshKey() });
+    } catch (error) {
+      notice(error.message, true);
+      show();
+    }
+  }
+
+  function show() {
+    for (const camera of state.cameras) cameras.state(camera);
+    power.textContent = t(state.streaming ? 'booth.stop' : 'booth.start');
+    power.className = state.streaming ? '' : 'primary';
+    const rate = state.framesets_hz === null ? '–' : t('booth.perSecond', { n: state.framesets_hz.toFixed(0) });
+    const rows = [
+      [t('booth.rate'), state.streaming ? rate : '–'],
+      [t('booth.queue'), String(state.spool.queue + state.spool.work)],
+      [t('booth.failed'), String(state.spool.failed)],
+      [t('booth.disk'), `${(state.disk_free_mb / 1000).toFixed(1)} GB`],
+      [t('booth.calibration'), state.calibration || t('booth.none')],
+    ];
+    facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name), h('dd', {}, value)]));
+    const fault = !state.running ? t('booth.notRunning', { fault: state.fault })
+      : state.disk_free_mb < 1.5 * state.disk_needed_mb ? t('booth.diskLow') : '';
+    banner.hidden = !fault;
+    banner.className = `banner ${state.running ? 'warn' : 'bad'}`;
+    banner.textContent = fault;
+    const last = state.last_check;
+    checkText.textContent = last === null ? t('booth.never')
+      : `${time(last.time)} – ${last.moved.length ? t('booth.checkMoved', { names: last.moved.join(', ') }) : t('booth.checkGood')}`;
+    deliveries.hidden = state.waiting_deliveries.length === 0;
+    deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
+      ...state.waiting_deliveries.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${one.error}` : ''}`)));
+  }
+
+  async function refresh() {
+    try {
+      state = await get('/booth');
+      show();
+    } catch { /* the connection's loss is told elsewhere */ }
+  }
+
+  main.replaceChildren(
+    h('div', { className: 'head' }, h('h1', {}, t('booth.title')), h('span', { className: 'grow' }), power),
+    banner,
+    h('div', { className: 'booth' },
+      h('div', {}, cameras.element,
+        h('div', { className: 'legend' }, h('span', { className: 'ramp depth' }), t('booth.legend'),
+          h('span', {}, h('span', { className: 'box grey' }), t('booth.outside')),
+          h('span', {}, h('span', { className: 'box white' }), t('booth.outline')))),
+      h('div', { className: 'stack' },
+        h('section', { className: 'card' }, facts),
+        h('section', { className: 'card' }, h('h2', {}, t('booth.check')), checkText, checkButton,
+          h('p', { className: 'small soft' }, t('booth.checkHow'))),
+        deliveries)));
+  show();
+  const timer = setInterval(refresh, REFRESH_MS);
+  const silence = listen((kind, data) => {
+    if (kind === 'camera') {
+      const at = state.cameras.findIndex((camera) => camera.name === data.name);
+      if (at >= 0) state.cameras[at] = data;
+      cameras.state(data);
+    } else if (kind === 'framesets') {
+      state.framesets_hz = data.rate_hz;
+      state.streaming = data.streaming;
+      show();
+    } else if (kind === 'calibration' && data.kind === 'check' && !data.running) {
+      checkButton.disabled = false;
+      if (data.error) notice(data.error, true);
+      refresh();
+    } else if (kind !== 'scan') refresh();
+  });
+  return () => { clearInterval(timer); silence(); cameras.close(); };
+}

@@ -1,0 +1,101 @@
+// The guided calibration, and the stored ones.
+
+import { freshKey, get, post, remove } from './api.js';
+import { Cameras } from './cameras.js';
+import { ask, h, notice } from './dom.js';
+import { listen } from './events.js';
+import { t, time } from './i18n.js';
+
+const STEPS = ['floor', 'ball', 'mark', 'around', 'depth', 'solve'];
+
+export async function calibration(main, session) {
+  const booth = await get('/booth');
+  const cameras = new Cameras(booth.cameras.map((camera) => camera.name), 'cameras mini');
+  for (const camera of booth.cameras) cameras.state(camera);
+  const now = h('section', { className: 'card now', id: 'now', 'aria-live': 'polite' });
+  const stored = h('section', { className: 'card' });
+  const begin = async (step, fresh = false) => {
+    try { show(await post('/calibration', { step, new: fresh }, { 'Idempotency-Key': freshKey() })); } catch (error) { notice(error.message, true); }
+  };
+  const say = async (word) => { try { show(await post('/task/answer', { answer: word })); } catch (error) { notice(error.message, true); } };
+  const halt = async () => { try { show(await remove('/task')); } catch (error) { notice(error.message, true); } };
+  const buttons = [];
+  const button = (step) => { const one = h('button', { 'data-step': step, onclick: () => begin(step), 'aria-label': `${t('cal.do')}: ${t(`cal.${step}`)}` }, t('cal.do')); buttons.push(one); return one; };
+
+  function idle(task) {
+    const tell = task.kind === 'calibrate' && (task.error || task.lines.length);
+    now.className = 'card';
+    now.replaceChildren(h('h2', {}, t('cal.all')),
+      task.error ? h('div', { className: 'banner bad', id: 'task-error' }, task.error) : '',
+      session.recordings ? h('p', { className: 'soft' }, t('cal.recordings')) : '',
+      h('div', { className: 'actions left' },
+        h('button', { className: 'primary', id: 'calibrate', onclick: () => begin('all') }, t('cal.continue')),
+        h('button', { id: 'anew', onclick: () => begin('all', true) }, t('cal.new'))),
+      tell ? h('div', { className: 'log', id: 'log' }, task.lines.map((line) => h('div', {}, line))) : '');
+  }
+
+  function running(task) {
+    const percent = /(\d+) % covered/.exec(task.progress);
+    const of = /(\d+) of (\d+)/.exec(task.progress);
+    const share = percent ? Number(percent[1]) / 100 : of ? Number(of[1]) / Number(of[2]) : null;
+    const bar = h('progress', { max: 1, 'aria-label': task.progress || t('loading') });
+    if (share !== null) bar.value = share;
+    now.className = 'card now';
+    now.replaceChildren(h('h2', {}, task.title || t('loading')), h('p', { className: 'instruction' }, task.waits_for === 'yes or no' ? task.question : task.instruction),
+      task.countdown_s ? h('div', { className: 'count' }, String(task.countdown_s)) : '',
+      h('div', { className: 'actions left' },
+        task.waits_for === 'go' ? h('button', { className: 'primary', onclick: () => say('go') }, t('cal.go')) : '',
+        task.waits_for === 'yes or no' ? h('button', { className: 'primary', onclick: () => say('yes') }, t('cal.yes')) : '',
+        task.waits_for === 'yes or no' ? h('button', { onclick: () => say('no') }, t('cal.no')) : '',
+        h('button', { className: 'danger', id: 'halt', onclick: halt }, t('cal.stop'))),
+      task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, task.progress || ' '), bar),
+      h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, line))));
+  }
+
+  function show(task) {
+    const busy = task.running;
+    for (const one of buttons) one.disabled = busy;
+    if (busy && task.kind === 'calibrate') running(task); else idle(task);
+  }
+
+  async function list() {
+    const found = await get('/calibrations');
+    const used = found.find((one) => one.in_use);
+    const entries = await Promise.all(found.map(async (one) => {
+      const shifts = used && !one.in_use ? await get(`/calibrations/${used.name}/comparison/${one.name}`).catch(() => []) : [];
+      return h('div', { className: 'stored', 'data-calibration': one.name },
+        h('div', { className: 'head tight' }, h('b', {}, time(one.created)), h('span', { className: 'grow' }),
+          one.in_use ? h('span', { className: 'chip good' }, t('cal.inUse')) : h('button', { onclick: () => use(one) }, t('cal.use'))),
+        h('div', { className: 'small soft' }, t('cal.rms', { n: one.residual_rms_mm, cameras: one.cameras.length })),
+        shifts.length ? h('details', { className: 'small' }, h('summary', {}, t('cal.compare')), ...shifts.map((shift) =>
+          h('div', {}, t('cal.shift', { camera: shift.camera, mm: shift.shift_mm, deg: shift.turn_deg })))) : '');
+    }));
+    stored.replaceChildren(h('h2', {}, t('cal.stored')), ...(entries.length ? entries : [h('p', { className: 'soft' }, t('cal.none'))]));
+  }
+
+  async function use(one) {
+    if (!await ask(t('cal.use'), t('cal.sureUse', { name: time(one.created) }), t('cal.use'), t('cancel'))) return;
+    try { await post(`/calibrations/${one.name}/use`); await list(); } catch (error) { notice(error.message, true); }
+  }
+
+  main.replaceChildren(
+    h('div', { className: 'head' }, h('h1', {}, t('cal.title'))),
+    h('div', { className: 'calibration' },
+      h('div', { className: 'stack' }, now, h('h2', { className: 'small' }, t('cal.sees')), cameras.element),
+      h('div', { className: 'stack' },
+        h('section', { className: 'card' }, h('h2', {}, t('cal.steps')), h('ol', { className: 'steps' }, STEPS.map((step, i) =>
+          h('li', {}, h('span', { className: 'n' }, String(i + 1)), h('span', { className: 'text' }, h('b', {}, t(`cal.${step}`)),
+            h('span', { className: 'small soft' }, t(`cal.${step}.what`))), button(step))))),
+        stored)));
+  show(await get('/task'));
+  await list();
+  let busy = false;
+  const silence = listen((kind, data) => {
+    if (kind === 'camera') cameras.state(data);
+    if (kind !== 'calibration') return;
+    show(data);
+    if (busy && !data.running) list().catch(() => {});
+    busy = data.running;
+  });
+  return () => { silence(); cameras.close(); };
+}

@@ -1,0 +1,179 @@
+// Taking a scan: one label, one button.
+
+import { freshKey, get, post } from './api.js';
+import { Cameras } from './cameras.js';
+import { h, notice, s } from './dom.js';
+import { listen } from './events.js';
+import { bodyFigure } from './figure.js';
+import { t, time } from './i18n.js';
+
+const AROUND = 2 * Math.PI * 108;
+const FINAL = ['delivered', 'rescan', 'failed'];
+const POLL_MS = 1000;
+
+export async function scan(main, session) {
+  const state = await get('/booth');
+  const front = state.cameras.map((camera) => camera.name).filter((name) => name.startsWith('front'));
+  const shown = front.length ? front : state.cameras.slice(0, 2).map((camera) => camera.name);
+  const cameras = new Cameras(shown, 'stack mini');
+  for (const camera of state.cameras) cameras.state(camera);
+  const presence = h('p', { className: 'soft', role: 'status' });
+  cameras.onpresence = (somebody) => { presence.textContent = t(somebody ? 'scan.somebody' : 'scan.nobody'); };
+  const stage = h('section', { className: 'card stage', id: 'stage', 'aria-live': 'polite' });
+  let streaming = state.streaming;
+  let label = '';
+  let current = null;
+  let pressed = 0;
+  let timer = null;
+
+  function ready() {
+    current = null;
+    clearInterval(timer);
+    const input = h('input', { type: 'text', id: 'label', value: label, maxLength: 200,
+      placeholder: t('scan.placeholder'), autocomplete: 'off', enterKeyHint: 'go',
+      onkeydown: (event) => { if (event.key === 'Enter') begin(); },
+      oninput: () => { label = input.value; } });
+    const help = streaming ? h('p', { className: 'soft' }, t('scan.ready'))
+      : h('div', {}, h('p', {}, t('scan.needSensors')), h('button', { id: 'sensors', onclick: sensors }, t('booth.start')));
+    stage.replaceChildren(
+      h('div', { className: 'label' }, h('label', { htmlFor: 'label' }, t('scan.label')), input),
+      h('button', { className: 'big primary', id: 'go', disabled: !streaming, onclick: begin }, t('scan.go')), help);
+  }
+
+  async function sensors(event) {
+    event.target.disabled = true;
+    try {
+      await post('/booth/start');
+      streaming = true;
+    } catch (error) { notice(error.message, true); }
+    ready();
+  }
+
+  async function begin() {
+    pressed = performance.now();
+    document.getElementById('go').disabled = true;
+    try {
+      const body = { label: label.trim(), countdown_s: session.countdown_s };
+      follow(await post('/scans', body, { 'Idempotency-Key': freshKey() }));
+    } catch (error) {
+      notice(error.message, true);
+      ready();
+    }
+  }
+
+  function follow(found) {
+    current = found;
+    clearInterval(timer);
+    // Events tell sooner; asking now and then bridges a lost connection.
+    timer = setInterval(ask, POLL_MS);
+    show({ left_s: session.countdown_s });
+  }
+
+  async function ask() {
+    if (!current) return;
+    try {
+      const found = await get(`/scans/${current.scan_id}`);
+      if (current && found.scan_id === current.scan_id) take(found);
+    } catch { /* asked again */ }
+  }
+
+  function take(found, more = {}) {
+    if (!current || FINAL.includes(current.state)) return;
+    const before = current.state;
+    current = { ...current, ...found };
+    if (found.state !== 'countdown' || more.left_s !== undefined) show(more);
+    if (FINAL.includes(current.state) && !FINAL.includes(before)) finish();
+  }
+
+  function ring(share, content, busy = false) {
+    const circle = { cx: 116, cy: 116, r: 108 };
+    return h('div', { className: busy ? 'ring busy' : 'ring' },
+      s('svg', { viewBox: '0 0 232 232', 'aria-hidden': 'true' }, s('circle', circle),
+        s('circle', { ...circle, class: 'done', 'stroke-dasharray': AROUND, 'stroke-dashoffset': AROUND * (1 - share) })),
+      content);
+  }
+
+  function show({ left_s: left } = {}) {
+    const name = h('h2', {}, current.label || t('result.noLabel'));
+    const give = h('button', { id: 'give-up', onclick: giveUp }, t('scan.give'));
+    const leave = h('p', { className: 'leave', id: 'leave' }, t('scan.leave'));
+    if (current.state === 'countdown' || current.state === 'armed') {
+      stage.replaceChildren(name, ring(left ? left / Math.max(1, session.countdown_s) : 0,
+        h('span', { className: 'number' }, String(left || '…'))), h('p', {}, t('scan.countdown')), give);
+    } else if (current.state === 'capturing') {
+      stage.replaceChildren(name, ring(current.framesets / Math.max(1, current.wanted),
+        h('span', { className: 'word' }, t('scan.hold'))), give);
+    } else if (current.state === 'accepted' || current.state === 'reconstructing') {
+      const words = t(current.state === 'accepted' ? 'scan.waiting' : 'scan.working');
+      stage.replaceChildren(name, leave, ring(0.3, h('span', { className: 'word' }, words), true));
+    }
+  }
+
+  async function giveUp(event) {
+    event.target.disabled = true;
+    try { await post(`/scans/${current.scan_id}/cancel`); } catch (error) { notice(error.message, true); }
+    ask();
+  }
+
+  async function finish() {
+    clearInterval(timer);
+    const done = current;
+    const seconds = ((performance.now() - pressed) / 1000).toFixed(1);
+    let doubtful = [];
+    if (done.state !== 'failed') {
+      try {
+        const quality = await get(`/scans/${done.scan_id}/quality`);
+        doubtful = quality.parts.filter((part) => part.doubtful).map((part) => part.name);
+      } catch { /* the verdict stands without it */ }
+    }
+    if (current !== done) return;
+    const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
+    const again = h('button', { id: 'again', className: look === 'ok' ? '' : 'primary', onclick: begin }, t('scan.again'));
+    again.addEventListener('click', () => { again.disabled = true; });
+    stage.replaceChildren(
+      done.state === 'failed' ? '' : h('p', { className: 'leave', id: 'leave' }, t('scan.leave')),
+      h('div', { className: `verdict ${look}`, id: 'verdict', 'data-verdict': look },
+        bodyFigure(doubtful),
+        h('div', {}, h('h2', {}, t(`scan.${look}`)), h('p', {}, done.label || t('result.noLabel')),
+          done.reasons.length ? h('ul', {}, done.reasons.map((reason) => h('li', {}, reason))) : null,
+          done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: seconds })))),
+      h('div', { className: 'actions' },
+        done.state === 'failed' ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
+        again,
+        h('button', { id: 'next', onclick: () => { label = ''; ready(); document.getElementById('label').focus(); } }, t('scan.next'))),
+      h('button', { id: 'go', hidden: true }));
+    latest();
+  }
+
+  const list = h('div', { className: 'stack' });
+  async function latest() {
+    try {
+      const { scans } = await get('/scans?limit=4');
+      list.replaceChildren(...scans.map((one) => h('a', { className: 'small', href: `#/result/${one.scan_id}` },
+        `${one.label || t('result.noLabel')} – ${t(`state.${one.state}`)}, ${time(one.created)}`)));
+    } catch { /* told elsewhere */ }
+  }
+
+  const silence = listen((kind, data) => {
+    if (kind === 'camera') cameras.state(data);
+    if (kind === 'framesets' && data.streaming !== streaming) {
+      streaming = data.streaming;
+      if (!current) ready();
+    }
+    if (!current || data.scan_id !== current.scan_id) return;
+    if (kind === 'scan' && data.state !== 'deleted') {
+      const { state: next, framesets, wanted, reason } = data;
+      take({ state: next, framesets, wanted, reasons: reason ? [reason] : [] }, { left_s: data.left_s });
+    } else if (kind === 'job') take({ state: data.state });
+    else if (kind === 'result') take({ state: data.state, reasons: data.reasons });
+  });
+
+  main.replaceChildren(
+    h('div', { className: 'head' }, h('h1', {}, t('scan.title'))),
+    h('div', { className: 'scan' }, stage,
+      h('aside', { className: 'stack', 'aria-label': t('scan.preview') }, cameras.element, presence,
+        h('section', { className: 'card' }, h('h2', {}, t('scan.last')), list))));
+  ready();
+  latest();
+  return () => { clearInterval(timer); silence(); cameras.close(); };
+}
