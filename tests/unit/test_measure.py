@@ -18,7 +18,7 @@ from workers.export.meshes import obj_mesh, ply_mesh
 from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
-from workers.measure.coverage import basis_of
+from workers.measure.coverage import SeenSkin
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.differences import side_differences
 from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
@@ -243,7 +243,8 @@ def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
 def test_a_row_says_whether_cameras_saw_its_line(model: BodyModel) -> None:
     """The front alone: what runs along the front is seen, the back's is the model's."""
     seen = model.mean[:, 1] < model.mean[model.landmarks["waist_side_left"], 1]
-    basis = {trace.definition.name: basis_of(trace, model.mean, seen)
+    skin = SeenSkin.build(model, model.mean, seen)
+    basis = {trace.definition.name: skin.basis(trace)
              for trace in trace_all(model, model.mean)}  # fmt: skip
     assert basis["across_front_skin_width"] == basis["crotch_length_front"] == "seen"
     assert basis["waist_girth"] == basis["belly_girth"] == "partly"

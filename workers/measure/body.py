@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.measure.coverage import Basis, basis_of
+from workers.measure.coverage import Basis, SeenSkin
 from workers.measure.intervals import Pose, content_interval, intervals, row_values
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
@@ -102,6 +102,7 @@ def _measured(
 ) -> MeasuredBody:
     traces = trace_all(model, vertices)
     values = row_values(traces, pose)
+    skin = None if vertex_seen is None else SeenSkin.build(model, shown, vertex_seen)
     rows = tuple(
         Measurement(
             trace.definition.name,
@@ -110,7 +111,7 @@ def _measured(
             interval,
             trace.path(shown),
             trace.closed,
-            basis_of(trace, vertices, vertex_seen),
+            "seen" if skin is None else skin.basis(trace),
             _parts_of(model, trace),
         )
         for trace, value, interval in zip(
