@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from true_measurements import TrueBody
 
+from station.archive.terms import TERMS
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from workers.export.meshes import obj_mesh, ply_mesh
@@ -66,6 +67,10 @@ def test_the_table_names_only_what_the_model_has(model: BodyModel) -> None:
     rows = {sides_pooled(definition.name) for definition in DEFINITIONS} | {"volume", "surface"}
     for models in shipped().values():
         assert rows == set(models)
+
+
+def test_every_row_has_a_plain_name() -> None:
+    assert {sides_pooled(definition.name) for definition in DEFINITIONS} == set(TERMS)
 
 
 def test_the_model_carries_the_landmarks_that_the_rules_find(model: BodyModel) -> None:
