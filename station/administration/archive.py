@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +23,8 @@ FORMAT = "booth-backup"
 VERSION = 1
 
 
+_DATABASE = ".sqlite"
+_JOURNALS = (f"*{_DATABASE}-wal", f"*{_DATABASE}-shm")
 _SCRATCH = ("tmp", "locks")
 """Folders of a spool that mean nothing without the processes that use them."""
 
@@ -159,9 +163,20 @@ def _copy(source: Path, target: Path) -> None:
             raise BoothError(f"{path} is a symbolic link; a backup holds plain files")
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.is_dir():
-        shutil.copytree(source, target, dirs_exist_ok=True)
+        ignore = shutil.ignore_patterns(*_JOURNALS)
+        shutil.copytree(source, target, copy_function=_copy_file, ignore=ignore, dirs_exist_ok=True)
     else:
+        _copy_file(source, target)
+
+
+def _copy_file(source: Path | str, target: Path | str) -> None:
+    """Copy a file; of a database whatever its last transaction left, also while it is written."""
+    if not str(source).endswith(_DATABASE):
         shutil.copy2(source, target)
+        return
+    with closing(sqlite3.connect(source)) as live, closing(sqlite3.connect(target)) as copy:
+        live.backup(copy)
+    shutil.copystat(source, target)
 
 
 def _remove(path: Path) -> None:

@@ -67,6 +67,7 @@ def booth_toml(cameras: Sequence[FreenectCamera], *, installed: bool) -> str:
     if installed:
         lines += ["", "[calibrate]", f'folder = "{STATE_FOLDER / "calibrations"}"']
         lines += ["", "[spool]", f'folder = "{STATE_FOLDER / "spool"}"']
+        lines += ["", "[console]", f'folder = "{STATE_FOLDER / "console"}"']
         lines += ["", "[runtime]", f'folder = "{RUNTIME_FOLDER}"']
     return "\n".join(lines) + "\n"
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import secrets
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import click
@@ -25,6 +27,7 @@ from station.administration.connected import (
     serial_numbers,
 )
 from station.administration.ownership import USER, give_to_booth, is_installed_root
+from station.console.security.vault import Vault
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.drivers import CameraConfig
 from station.core.errors import BoothError, ConfigError, DriverError
@@ -34,6 +37,8 @@ from station.sensors.freenect import FreenectCamera
 _ANSWER_S = 30.0
 """Control answers a second after its start; cold disks and four more processes take longer."""
 _COMMAND = "/usr/bin/station"
+_PASSWORD_GROUPS = 4
+"""Groups of 16 random bits: 64 bits are too many to try against argon2id."""
 _BODY = Path(__file__).parents[1] / "simulation/bodies/ann.npz"
 _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
 """Folders that the services do not see."""
@@ -90,6 +95,8 @@ def setup(
         click.echo(f"  {camera.name:<16} {_source(camera)}")
     if recordings is not None and changed:
         _take_calibration(recordings, config)
+    if installed and config.console.enabled:
+        _give_password(config)
     if start and installed and units.installed():
         units.start(afresh=changed)
         _wait_for_control()
@@ -161,6 +168,19 @@ def _take_calibration(recordings: Path, config: BoothConfig) -> None:
         write_bytes(config.calibration, source.read_bytes())
         give_to_booth([config.calibration])
         click.echo(f"{config.calibration}: taken from {recordings}")
+
+
+def _give_password(config: BoothConfig) -> None:
+    """A password for the console where there is none; it is shown once."""
+    with closing(Vault(config.console.folder)) as vault:
+        missing = not vault.has_password
+        if missing:
+            password = "-".join(secrets.token_hex(2) for _ in range(_PASSWORD_GROUPS))
+            vault.set_password(password)
+    if missing:
+        click.echo(f"the console's password, shown this once: {password}")
+        click.echo("  another one: station console --set-password")
+    give_to_booth([config.console.folder])
 
 
 def _wait_for_control() -> None:

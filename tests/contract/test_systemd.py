@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from station.administration import booth_file
+from station.booth.supervisor import services
 from station.cli import COMMANDS as STATION
+from station.core.config import load_config
 from workers.cli import COMMANDS as RECONSTRUCT
 
 ROOT = Path(__file__).parents[2]
@@ -47,6 +50,7 @@ def test_a_service_comes_back_whatever_happens(path: Path) -> None:
         assert unit["Service"]["Restart"] == "always"
         assert float(unit["Service"]["RestartSec"]) <= 2.0
         assert float(unit["Service"]["WatchdogSec"]) <= 60.0
+        assert int(unit["Service"]["MemoryMax"][:-1]) > 0
 
 
 def test_the_target_wants_units_that_exist() -> None:
@@ -71,7 +75,26 @@ def test_every_camera_of_the_configuration_gets_its_service(tmp_path: Path) -> N
     assert str(config) in generator.read_text()
     subprocess.run([sys.executable, generator, tmp_path / "out"], check=True)
     made = {path.name for path in (tmp_path / "out/booth.target.wants").iterdir()}
-    assert made == {"booth-capture@front-lower.service", "booth-capture@porch.service"}
+    captures = {"booth-capture@front-lower.service", "booth-capture@porch.service"}
+    assert made == captures | {"booth-console.service"}
+
+
+def test_console_and_deliver_run_as_the_configuration_says(tmp_path: Path) -> None:
+    """`station run` and systemd start the same processes."""
+    config = tmp_path / "booth.toml"
+    cameras = booth_file.name_cameras(["A"], [])
+    text = booth_file.booth_toml(cameras, installed=False)
+    config.write_text(f'{text}[console]\nenabled = false\n[[deliver]]\nname = "d"\nfolder = "d"\n')
+    program = (UNITS / "booth-generator").read_text()
+    generator = tmp_path / "generator"
+    generator.write_text(program.replace(f'"{booth_file.CONFIG}"', f'"{config}"'))
+    subprocess.run([sys.executable, generator, tmp_path / "out"], check=True)
+    made = {path.stem for path in (tmp_path / "out/booth.target.wants").iterdir()}
+    fixed = re.findall(r"booth-\w+(?=\.service)", (UNITS / "booth.target").read_text())
+    units = {
+        name.removeprefix("booth-").replace("capture@", "capture ") for name in made | {*fixed}
+    }
+    assert units == {service.name for service in services(load_config(config), config)}
 
 
 @pytest.mark.parametrize("text", ["", "[[cameras", "cameras = 3", "[[cameras]]\nserial = 'A'"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -139,6 +141,19 @@ def test_restoring_keeps_what_it_replaces(booth: Path, tmp_path: Path) -> None:
     assert calibration.read_text() == "{}"
     old = calibration.with_name(".calibration.json.before-restore")
     assert old.read_text() == '{"newer": true}'
+
+
+def test_a_database_is_saved_while_it_is_written(booth: Path, tmp_path: Path) -> None:
+    """The rows since the last checkpoint are in a journal beside it: copies of files lack them."""
+    with closing(sqlite3.connect(booth.parent / "spool/tokens.sqlite")) as live:
+        live.execute("PRAGMA journal_mode = WAL")
+        live.execute("CREATE TABLE token (name TEXT)")
+        live.execute("INSERT INTO token VALUES ('till')")
+        live.commit()
+        saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
+    copy = saved / "content/spool/tokens.sqlite"
+    with closing(sqlite3.connect(copy)) as restored:
+        assert restored.execute("SELECT name FROM token").fetchall() == [("till",)]
 
 
 @pytest.mark.parametrize("fault", ["changed", "missing", "extra", "version", "name"])
