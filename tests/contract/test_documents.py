@@ -326,3 +326,8 @@ def test_the_code_names_documents_and_headings_that_exist() -> None:
             if not document.exists() or (heading and _slug(heading) not in _anchors(document)):
                 missing.append(f"{path.relative_to(ROOT)}: {name} {heading}")
     assert missing == []
+
+
+def test_the_documented_test_folders_are_those_that_exist() -> None:
+    folders = {str(path.parent.relative_to(ROOT)) for path in (ROOT / "tests").glob("*/*.py")}
+    assert _first_cells(ROOT / "CONTRIBUTING.md", "Set up") == folders
