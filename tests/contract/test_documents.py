@@ -331,3 +331,19 @@ def test_the_code_names_documents_and_headings_that_exist() -> None:
 def test_the_documented_test_folders_are_those_that_exist() -> None:
     folders = {str(path.parent.relative_to(ROOT)) for path in (ROOT / "tests").glob("*/*.py")}
     assert _first_cells(ROOT / "CONTRIBUTING.md", "Set up") == folders
+
+
+def test_the_notice_names_all_data_and_whatever_is_vendored() -> None:
+    lines = (ROOT / "NOTICE").read_text().split("\n")
+    named = {
+        path for line in lines if "/" in line.split(" ")[0] for path in ROOT.glob(line.strip())
+    }
+    folders = ("station", "workers", "deploy", "docs")
+    files = {path for folder in folders for path in (ROOT / folder).rglob("*")}
+    data = {
+        path for path in files if path.suffix in (".npz", ".npy", ".csv", ".gz", ".png", ".ttf")
+    }
+    data |= {path for path in files if path.parent.name == "data" and path.suffix == ".json"}
+    data |= {path for path in files if path.parent.name == "vendor" and path.is_dir()}
+    unnamed = {path for path in data if not named & {path, *path.parents}}
+    assert {str(path.relative_to(ROOT)) for path in unnamed} == set()
