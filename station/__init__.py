@@ -1,3 +1,3 @@
-"""What runs in the booth: sensors, clocks, framesets, calibration, scans, the operator."""
+"""The booth's programs: sensors, clocks, framesets, calibration, scans, the operator's commands."""
 
 __version__ = "0.1.0"

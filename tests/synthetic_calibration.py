@@ -62,7 +62,7 @@ def factory(rig: Rig) -> dict[str, CameraCalibration]:
 
 
 def true_correction(error: UnitError) -> DepthCorrection:
-    """What undoes a unit's depth error."""
+    """The correction that undoes a unit's depth error."""
     shift = 0.25 * error.bias_m
     tilt_x, tilt_y = error.tilt
     parameters = (shift, error.gain, error.curvature, shift * tilt_x, shift * tilt_y)
@@ -103,7 +103,7 @@ def observations(
 def detections(
     procedure: VirtualProcedure, cameras: Sequence[str], center_m: Array, time_s: float
 ) -> list[BallDetection]:
-    """What some cameras see, at one time, of something as round as the ball."""
+    """Detections that some cameras make, at one time, of something as round as the ball."""
     rng = np.random.default_rng((procedure.booth.seed, round(1e3 * time_s)))
     found = []
     for name in cameras:
@@ -236,7 +236,7 @@ def _bumped(seen: Observations, camera: str) -> Observations:
 
 
 def _head_on_mark(seen: Observations) -> Observations:
-    """What one camera took for the resting ball is as high as a head, and nobody saw the floor."""
+    """One camera took a head for the resting ball, and no camera saw the floor."""
     highest = min(
         (ball for ball in seen.balls if ball.camera == "back-upper"),
         key=lambda ball: float(ball.center_m[1] / ball.center_m[2]),

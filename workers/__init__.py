@@ -1,1 +1,1 @@
-"""What turns a scan bundle into a body: the SCAPE model, its fit, measurements and exports."""
+"""From a scan bundle to a body: the SCAPE model, its fit, measurements and exports."""

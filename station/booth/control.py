@@ -74,7 +74,7 @@ class ControlProcess:
         self._context.destroy(linger=0)
 
     def _remembered(self) -> bool:
-        """What the operator wanted last: a restarted control must not stop the sensors."""
+        """The operator's last order: a restarted control must not stop the sensors."""
         try:
             return bool(json.loads(self._memory.read_text())["streaming"])
         except (OSError, ValueError, KeyError):

@@ -18,7 +18,7 @@ class Frameset(Generic[Frame]):
 
     frames: dict[str, Frame]
     time_s: float
-    """Of its last frame."""
+    """Time of its last frame."""
     spread_s: float
 
 

@@ -1,4 +1,4 @@
-"""What the operator types: start, scan, status, stop."""
+"""The operator's commands: start, scan, status, stop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long body scans are kept, and how one is deleted."""
+"""Retention of body scans, and the deletion of one."""
 
 from __future__ import annotations
 

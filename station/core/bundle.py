@@ -31,7 +31,7 @@ _ENCODERS = 2
 
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
-    """Where one depth frame lies and when it was taken."""
+    """The file of one depth frame, and the time at which it was taken."""
 
     file: str
     """Path inside the bundle, with forward slashes."""

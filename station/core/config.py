@@ -52,7 +52,7 @@ class Volume(Strict):
 
 
 class SyncConfig(Strict):
-    """How frames of the cameras are matched."""
+    """Matching of the cameras' frames."""
 
     tolerance_s: float = Field(default=0.025, gt=0.0, le=0.5, description="a set's widest spread")
     silent_after_s: float = Field(
@@ -62,7 +62,7 @@ class SyncConfig(Strict):
 
 
 class ScanConfig(Strict):
-    """What one scan takes."""
+    """Length of one scan."""
 
     framesets: int = Field(default=10, ge=1, le=100)
     max_duration_s: float = Field(
@@ -71,7 +71,7 @@ class ScanConfig(Strict):
 
 
 class CalibrateConfig(Strict):
-    """How the booth is calibrated."""
+    """Calibration of the booth."""
 
     folder: ConfigPath = Field(default=Path("calibrations"), description="all dated calibrations")
     ball_radius_m: Annotated[float, AfterValidator(_found_afar)] = Field(default=0.1, le=0.3)
@@ -96,7 +96,7 @@ class DriftConfig(Strict):
 
 
 class SpoolConfig(Strict):
-    """Where scans and results lie; one local file system (file locks and renames)."""
+    """Folder of scans and results, on one local file system (it needs file locks and renames)."""
 
     folder: ConfigPath = Path("spool")
     min_free_mb: float = Field(default=500.0, ge=0.0, description="a scan is refused below this")

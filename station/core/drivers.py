@@ -46,7 +46,7 @@ class Strict(BaseModel):
 
 
 class CameraConfig(Strict):
-    """What every camera's section holds; each driver adds keys of its own."""
+    """Keys of every camera's section; each driver adds its own."""
 
     name: Name = Field(description="the camera's name in the calibration and in every message")
     driver: str = Field(description="how it is read: the name of an installed driver")

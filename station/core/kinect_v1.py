@@ -32,7 +32,7 @@ DEPTH_SCALE_M = 1e-4
 _FARTHEST_M = 6.0
 
 RANDOM_SIGMA = 1.425e-3
-"""Of one pixel that sees a surface squarely, 1/m."""
+"""Standard deviation of one pixel that sees a surface squarely, 1/m."""
 STEP = 1.0 / (8.0 * FOCAL_PX * BASELINE_M)
 """Between neighbouring readings, 1/m."""
 CORRELATED_PX = 32.0

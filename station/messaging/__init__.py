@@ -1,3 +1,3 @@
-"""What crosses a socket between the booth's processes: messages, topics, and how sockets are made.
+"""Messages between the booth's processes: their fields, the topics, and how sockets are made.
 What a process does with a message belongs to the process.
 """

@@ -16,7 +16,7 @@ from station.core.errors import FormatError
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What all messages share: how they are packed and refused."""
+    """Packing and checking that all messages share."""
 
     VERSION: ClassVar[int] = 1
 
@@ -67,17 +67,17 @@ class FrameHeader(Message):
     device_ticks: int
     tick_hz: float
     host_time_s: float
-    """When it was taken, host's monotonic clock, by the clock model."""
+    """Time at which it was taken: the host's monotonic clock, by the clock model."""
     received_s: float
-    """When it reached the host, same clock."""
+    """Time at which it reached the host, same clock."""
     sequence: int
     clock_resets: int
-    """How often the sensor's clock was reset: times before and after have nothing in common."""
+    """Resets of the sensor's clock so far: times before and after one have nothing in common."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth(Message):
-    """What a capture process says of its sensor, twice a second."""
+    """The state of a sensor, sent by its capture process twice a second."""
 
     camera: str
     state: str
@@ -90,7 +90,7 @@ class CameraHealth(Message):
 
 @dataclass(frozen=True, slots=True)
 class SensorInfo(Message):
-    """Which sensor a camera is, with the lens that its driver knows; told beside its health."""
+    """The sensor of a camera, with the lens that its driver knows; sent beside its health."""
 
     camera: str
     serial: str
@@ -108,7 +108,7 @@ class SensorInfo(Message):
 
 @dataclass(frozen=True, slots=True)
 class DesiredState(Message):
-    """What the operator wants, repeated: capture processes follow it, however often it comes."""
+    """The operator's order, repeated: capture processes follow it, however often it comes."""
 
     streaming: bool
 
@@ -134,7 +134,7 @@ class Reply(Message):
 
 @dataclass(frozen=True, slots=True)
 class ScanEvent(Message):
-    """What sync says of a scan that it collects."""
+    """Progress of a scan that sync collects."""
 
     scan_id: str
     state: str

@@ -1,4 +1,4 @@
-"""How sockets are made: local ipc with limits, timeouts and private files."""
+"""Sockets: local ipc with limits, timeouts and private files."""
 
 from __future__ import annotations
 

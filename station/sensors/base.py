@@ -1,4 +1,4 @@
-"""What every depth sensor driver gives, whatever the sensor.
+"""The interface of depth sensor drivers.
 
 A driver is a class with these three methods, made from its camera's section of booth.toml. It is
 found through an entry point, see `station.core.drivers`; nothing else has to know it.

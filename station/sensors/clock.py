@@ -36,7 +36,7 @@ class DeviceClock:
     """(device seconds, least delay) of each bucket."""
 
     def host_time_s(self, ticks: int, arrival_s: float) -> float:
-        """When a frame was taken, host's monotonic seconds.
+        """Time at which a frame was taken, on the host's monotonic clock, in seconds.
 
         A counter that jumps back, or apart from the host's clock by over a second, was reset: the
         model starts anew.

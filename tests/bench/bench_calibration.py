@@ -51,7 +51,7 @@ class Row:
 
     seed: int
     shift_mm: Array
-    """Of each pair of cameras."""
+    """Errors of each pair of cameras."""
     turn_deg: Array
     normalised: float
     """Squared error of all poses relative to the reference's, in units of their covariance."""
@@ -152,7 +152,7 @@ def _cloud(booth: SimulatedBooth, rig: Rig, mesh: Mesh, folder: Path) -> Array:
 
 
 def refusals() -> None:
-    """What must not become a calibration, and what the operator reads."""
+    """Sessions that must be refused, and the operator's messages."""
     procedure = VirtualProcedure(synthetic.booth(101))
     seen = synthetic.observations(procedure)
     cameras = synthetic.factory(procedure.booth.rig)

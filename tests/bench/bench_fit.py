@@ -147,7 +147,7 @@ def peers_of(row: Row, model: BodyModel, scan: Preprocessed) -> list[PeerRow]:
 
 
 def bad_input(model: BodyModel, cases: Iterable[Case], body: Mesh, folder: Path) -> int:
-    """What becomes of each; returns how many became a confident body."""
+    """Print the outcome of each; return how many became a confident body."""
     print("\nbad input: an error or a rescan that says why")
     confident = 0
     for case in cases:

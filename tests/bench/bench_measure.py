@@ -48,7 +48,7 @@ PAPERS_FIVE_MM = {
     "height": 3.0, "waist_girth": 8.0, "arm_length_left": 6.0, "arm_length_right": 6.0,
     "lower_leg_length_left": 5.0, "lower_leg_length_right": 5.0, "shoulder_width": 6.0,
 }  # fmt: skip
-"""What Zhou et al. 2013 report on, and the limit of the mean absolute error here."""
+"""Rows that Zhou et al. 2013 report on, and the limit of the mean absolute error here."""
 REPEAT_LIMIT_MM = {"large girth": 5.0, "height": 3.0, "length": 3.0, "distance": 3.0}
 _SEED = {"validation": 21, "test": 31}
 _POOL = 96
@@ -58,7 +58,7 @@ _REPEAT_TURN_DEG = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What the booth saw of one body, and what is true of it."""
+    """One body as the booth saw it, and its true measurements."""
 
     name: str
     truth: dict[Pose, dict[str, float]]

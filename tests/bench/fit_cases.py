@@ -128,7 +128,7 @@ def other_cases(folder: Path) -> Iterator[Case]:
 
 
 def hard_cases(bodies: TestBodies) -> Iterator[Case]:
-    """What goes wrong in a shop."""
+    """Difficult scans as they occur in a shop."""
     body = bodies.body(0)
     centers = body.vertices[body.faces].mean(axis=1)[:, 2]
     low, high = np.quantile(centers, [0.42, 0.52])
@@ -160,7 +160,7 @@ def rig_cases(body: Mesh) -> Iterator[Case]:
 
 
 def bad_cases(body: Mesh) -> Iterator[Case]:
-    """What is no adult in one piece: none of it may become a body that the operator trusts."""
+    """Input that does not show one whole adult: none of it may become a body that is trusted."""
     day = SimulatedBooth(seed=5)
     centers = body.vertices[body.faces].mean(axis=1)
     middle = 0.5 * np.ptp(body.vertices[:, 2])

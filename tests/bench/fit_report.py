@@ -1,4 +1,4 @@
-"""What bench_fit prints: tables of cases and the bars, each met or missed."""
+"""Tables that bench_fit prints: cases, and the bars, each met or missed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class PeerRow:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """What the product promises."""
+    """A limit that the product promises to keep."""
 
     words: str
     value: float | None
@@ -113,7 +113,7 @@ def print_summary(rows: dict[str, list[Row]]) -> None:
 
 
 def print_worst_parts(rows: dict[str, list[Row]]) -> None:
-    """Where errors sit: each part's rms over a group's cases, and the case where it is worst."""
+    """Print each part's rms over a group's cases, and the case where it is worst."""
     print("\nworst parts, rms in mm over the group's cases, and in which case it is worst")
     for group, found in rows.items():
         names = sorted({name for row in found for name in row.errors.by_part})

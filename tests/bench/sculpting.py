@@ -42,7 +42,7 @@ class Body:
         return self.share("pelvis", "abdomen", "chest")
 
     def facing(self, direction: tuple[float, float, float]) -> Array:
-        """How much (P,) each vertex faces a direction: 0 to 1."""
+        """Share (P,) by which each vertex faces a direction: 0 to 1."""
         return np.clip(self.normals @ np.asarray(direction), 0.0, 1.0)
 
 
@@ -313,7 +313,7 @@ def hands_and_feet(body: Body, rng: Random) -> Array:
 
 
 def everywhere(body: Body, rng: Random) -> Array:
-    """What is peculiar about a body for no reason, at all wavelengths from 6 to 40 cm."""
+    """Individual irregularities of a body, at all wavelengths from 6 to 40 cm."""
     v = body.vertices
     fine = ("head", "hand", "thumb", "fingers", "foot")
     skin = 1.0 - body.share(*(name for name in body.parts if name.startswith(fine)))

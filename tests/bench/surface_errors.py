@@ -1,4 +1,4 @@
-"""How far a result lies from the true surface, measured at the true surface's points."""
+"""Distances of a result from the true surface, measured at the true surface's points."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class TrueBody:
         return at[plane.front], normal / np.sqrt(normal @ normal)
 
     def _segments(self, point: Array, normal: Array, parts: tuple[str, ...]) -> Array:
-        """Where a plane cuts the triangles of some parts: (n, 2, 3)."""
+        """Segments (n, 2, 3) in which a plane cuts the triangles of some parts."""
         mine = np.isin(self._part, parts)[self._faces].all(axis=1)
         corners = self._v[self._faces[mine]]
         height = (corners - point) @ normal

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 _WAVES = 40
 _REFERENCE_M = 1.7
-"""Where the bias has its nominal size; it grows with the square of the depth."""
+"""Depth at which the bias has its nominal size; it grows with the square of the depth."""
 _SILHOUETTE_M = 0.05
 """A jump of depth between neighbouring pixels that makes a silhouette."""
 _NOTHING_M = 9.0
@@ -34,7 +34,7 @@ _HOLE = np.ones((5, 5), np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class UnlikeSensor:
-    """How far the sensors and the calibration are off."""
+    """Errors of the sensors and of the calibration."""
 
     bias_m: float = 1.5e-3
     """Root mean square of each sensor's bias, at 1.7 m."""
@@ -86,7 +86,7 @@ def render_unlike(
 
 
 def _misplaced(rig: Rig, sensor: UnlikeSensor, rng: np.random.Generator) -> Rig:
-    """Where the cameras really stand."""
+    """The true places of the cameras."""
     cameras = {}
     for name, camera in rig.cameras.items():
         turn, shift = rng.standard_normal((2, 3))

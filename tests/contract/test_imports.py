@@ -1,4 +1,4 @@
-"""Who may import whom: read from the code, and from what a started process really loads."""
+"""Import rules, read from the code, and from the modules that a started process really loads."""
 
 import ast
 import subprocess
@@ -71,7 +71,7 @@ def test_workers_import_the_core_of_the_station_alone() -> None:
 
 
 def test_the_fit_never_imports_the_learning() -> None:
-    """What learns the model needs torch and a database; a booth has neither."""
+    """Learning the model needs torch and a database; a booth has neither."""
     offenders = [
         (path, module)
         for path in _sources("station", "workers")

@@ -1,4 +1,4 @@
-"""What the operator hears when a camera is not as it should be."""
+"""Messages to the operator when a camera is not as it should be."""
 
 import json
 import os

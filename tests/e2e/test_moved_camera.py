@@ -39,7 +39,7 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the cameras see of the empty booth."""
+    """Frames of the empty booth."""
     folder = tmp_path_factory.mktemp("scene")
     empty = SimulatedBooth(clutter=fixed_posts())
     for name in empty.rig.cameras:

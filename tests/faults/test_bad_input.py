@@ -1,4 +1,4 @@
-"""What others hand to `reconstruct fit`: a clear line, an exit code, nothing half written."""
+"""Bad input to `reconstruct fit`: a clear line, an exit code, nothing half written."""
 
 import json
 import shutil

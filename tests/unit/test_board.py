@@ -29,7 +29,7 @@ def _drawing(board: Board = BOARD) -> NDArray[np.uint8]:
 def _image(
     camera: CameraCalibration, camera_from_board: NDArray[np.float64], board: Board = BOARD
 ) -> NDArray[np.uint8]:
-    """What a camera without distortion sees of a board in its frame."""
+    """Image of a board by a camera without distortion."""
     step = board.square_m / _DRAWN_PX
     metres_from_drawing = np.array([[step, 0.0, 0.5 * step], [0.0, step, 0.5 * step], [0, 0, 1.0]])
     plane = camera_from_board[:3, [0, 1, 3]]

@@ -1,4 +1,4 @@
-"""What `station calibrate` says when nothing has to be seen for it."""
+"""Messages of `station calibrate` that need no camera."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from station.calibration.solve.pairwise import Track, relate_all
 
 
 def track(times_s: np.ndarray, late_s: np.ndarray | float = 0.0) -> Track:
-    """Of a ball that is waved slowly, as a clock that is late tells it."""
+    """Track of a ball that is waved slowly, timed by a clock that is late."""
     turns = 2.0 * np.pi * np.outer(times_s, (0.06, 0.04, 0.05))
     return Track(
         np.asarray(times_s + late_s), np.array((0.5, 0.4, 0.7)) * np.sin(turns) + (0.0, 0.0, 1.7)

@@ -1,4 +1,4 @@
-"""How high the head reaches, by where it ends in images."""
+"""The height of the head, from its end in the images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -52,7 +52,7 @@ def _view(
     bald: bool = True,
     beside: Sequence[Mesh] = (),
 ) -> CameraView:
-    """What a sensor without noise reads of a body, up to 71 degrees of incidence."""
+    """View of a body by a sensor without noise, up to 71 degrees of incidence."""
     dark = np.zeros(len(model.faces), bool)
     if not bald:
         dark = body[model.faces][:, :, 2].mean(axis=1) > body[:, 2].max() - 0.045

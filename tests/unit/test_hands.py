@@ -33,7 +33,7 @@ def _with_fingers(model: BodyModel, curl_sd: float, turn_sd: float) -> BodyState
 
 
 def _found(model: BodyModel, truth: BodyState) -> tuple[float, float]:
-    """How far half-closed fingers are off before and after they are searched for, rms in metres."""
+    """Errors of half-closed fingers before and after the search, rms in metres."""
     vertices = model.vertices(truth)
     cloud = OrientedTree.build(vertices, vertex_normals(vertices, model.faces))
     start = _with_fingers(model, 0.6, 0.0)

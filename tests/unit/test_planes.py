@@ -1,4 +1,4 @@
-"""What planes say of themselves: a floor is not as flat as its number of pixels makes believe."""
+"""Stated errors of planes: a floor is not as flat as its number of pixels suggests."""
 
 import numpy as np
 

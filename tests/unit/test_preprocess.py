@@ -45,7 +45,7 @@ def test_a_flickering_pixel_is_no_reading() -> None:
 
 @pytest.mark.parametrize("frames", [1, 4, 9])
 def test_averages_are_what_their_definition_says(frames: int) -> None:
-    """Where the extremes agree no median is looked for; the result is the same."""
+    """No median is computed where the extremes agree; the result is the same."""
     rng = np.random.default_rng(frames)
     spread = rng.choice([2.0, 60.0, 400.0], (1, 8, 40))
     stack = np.round(15_000 + spread * rng.standard_normal((frames, 8, 40))).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""What makes a scan unusable, and what is only remarked."""
+"""Findings that make a scan unusable, and those that are only remarked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the cameras saw of a person: the merged cloud, each camera's image, and findings."""
+"""A person as the cameras saw them: the merged cloud, each camera's image, and findings."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class PointCloud:
     """(n,): index into camera_names."""
     camera_names: tuple[str, ...]
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the origin of a bare cloud's points was in its own frame, turned z up."""
+    """The origin of a bare cloud's points in its own frame, turned z up."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,7 +64,7 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True)
 class Preprocessed:
-    """What the fit works on."""
+    """The input of the fit."""
 
     cloud: PointCloud
     views: tuple[CameraView, ...]

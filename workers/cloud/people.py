@@ -1,4 +1,4 @@
-"""How many people stand in what hangs together: those who touch are one piece, with two heads."""
+"""Counting people in a connected piece: two who touch are one piece with two heads."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _is_person(
 
 
 def _apart(centers: list[Array]) -> int:
-    """How many of some places (2,) are not beside one that was counted."""
+    """Number of places (2,) that are not beside one that was counted already."""
     counted: list[Array] = []
     for center in centers:
         if all(np.linalg.norm(center - other) > _APART_M for other in counted):

@@ -56,7 +56,7 @@ _LEADER: Color = (176, 172, 168)
 _WARNING: Color = (40, 60, 170)
 _FLOOR: Color = (226, 224, 222)
 _BEHIND_M = 0.012
-"""How far behind the skin a girth's line counts as hidden; it lies on the skin's far side."""
+"""Depth behind the skin at which a girth's line counts as hidden: it is on the far side."""
 _BENEATH_M = 0.06
 """The same for straight distances, which run beneath the skin on the near side too."""
 _STATURE_GAP = 16

@@ -1,4 +1,4 @@
-"""What measurements rest on: skin that cameras saw, or the body model."""
+"""The basis of measurements: skin that cameras saw, or the body model."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class SeenSkin:
         return float(self.share[self.tree.query(places)[1]].mean())
 
     def basis(self, trace: Trace) -> Basis:
-        """What a row rests on."""
+        """The basis of a row."""
         share = self.seen_along(trace)
         if share >= SEEN_SHARE:
             return "seen"

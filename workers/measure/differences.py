@@ -14,7 +14,7 @@ _LEFT, _RIGHT = "_left", "_right"
 
 @dataclass(frozen=True, slots=True)
 class SideDifference:
-    """How much larger a measurement is on the left than on the right."""
+    """The difference of a measurement between left and right."""
 
     name: str
     """Name of both rows without the side."""

@@ -28,7 +28,7 @@ class EdgePoints:
     share: Array
 
     def on(self, vertices: Array) -> Array:
-        """Where they are (n, 3) on vertices (P, 3)."""
+        """Places (n, 3) on a body with vertices (P, 3)."""
         start = vertices[self.tail]
         return np.asarray(start + self.share[:, None] * (vertices[self.head] - start))
 
@@ -63,7 +63,7 @@ class EdgeNet:
 
     @classmethod
     def build(cls, faces: Faces) -> EdgeNet:
-        """Of triangles (k, 3)."""
+        """Build the net of triangles (k, 3)."""
         corners = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), 1)
         owner = np.repeat(np.arange(len(faces)), 3)
         pairs, edge = np.unique(corners, axis=0, return_inverse=True)
@@ -74,7 +74,7 @@ class EdgeNet:
         return cls(pairs[:, 0].astype(np.intp), pairs[:, 1].astype(np.intp), left, right)
 
     def cut(self, vertices: Array, point: Array, normal: Array) -> tuple[EdgePoints, Index]:
-        """Where a plane cuts the edges: the points, and which edge each lies on."""
+        """Points at which a plane cuts the edges, and the edge of each."""
         away = vertices @ normal - point @ normal
         from_m, to_m = away[self.tails], away[self.heads]
         crossing = np.flatnonzero((from_m < 0.0) != (to_m < 0.0))
@@ -83,7 +83,7 @@ class EdgeNet:
         return found, crossing
 
     def pieces(self, crossing: Index) -> Index:
-        """Which connected piece of a section each cut edge belongs to.
+        """The connected piece of a section that each cut edge belongs to.
 
         A cut triangle has two cut edges: it joins them.
         """
@@ -109,7 +109,7 @@ def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]
 
 
 def hull_order(points: Array, normal: Array) -> Index:
-    """Which of the points (n, 3) of a plane section a tight tape touches, in order.
+    """Indices, in order, of the points (n, 3) of a plane section that a tight tape touches.
 
     Raises:
         ValueError: fewer than three points, or all on a line.
@@ -155,12 +155,12 @@ def loop_length(points: Array, *, closed: bool) -> float:
 
 
 BELOW_CHORD, ABOVE_CHORD = 0.10, 0.45
-"""What lies farther from the straight line than these shares of its length is another part of the
+"""Points farther from the straight line than these shares of its length are another part of the
 body."""
 
 
 def surface_order(points: Array, start: Array, end: Array, outward: Array, *, taut: bool) -> Index:
-    """Which of the points (n, 3) of a section lie outside between start and end, in order.
+    """Indices, in order, of the points (n, 3) of a section on its outside from start to end.
 
     The section is that of the plane of both ends and of `outward`. A taut tape skips hollows.
     """
@@ -182,7 +182,7 @@ def surface_order(points: Array, start: Array, end: Array, outward: Array, *, ta
 
 @numba.njit(cache=True)
 def _taut(u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Which of the points (n,), sorted by u, a tape above them touches, first and last included."""
+    """Indices of the points (n,), sorted by u, that a tape above them touches, ends included."""
     kept = np.empty(len(u), np.int64)
     size = 0
     for here in range(len(u)):

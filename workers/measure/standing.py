@@ -19,7 +19,7 @@ _ARM_FROM_TRUNK_RAD = np.radians(20.0)
 _LEG_INWARDS_RAD = np.radians(6.0)
 """From the neutral pose's straddle; it brings the feet of the mean body 0.2 m apart."""
 _SHOULDER_GIRDLE_SHARE = 0.15
-"""How much of the arm's turn the shoulder blade and collar bone take."""
+"""Share of the arm's turn that the shoulder blade and collar bone take."""
 
 
 def standard_turns(model: BodyModel) -> dict[str, Array]:

@@ -14,7 +14,7 @@ FINER = 2
 
 @numba.njit(cache=True, nogil=True)
 def nearest_triangles(u, v, depth, shade, faces, height, width):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """What each sample of a picture sees: the depth (infinite where nothing is), the triangle
+    """Rasterise triangles: at each sample the depth (infinite where nothing is), the triangle
     (-1) and the shade there, each (FINER height, FINER width).
 
     Args:

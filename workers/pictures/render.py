@@ -50,14 +50,14 @@ class Frame:
         return np.array(VIEWS[self.view][1])
 
     def pixels(self, points: Array) -> Array:
-        """Where points (n, 3) lie in the picture, (n, 2)."""
+        """Pixels (n, 2) of points (n, 3)."""
         offsets = points - np.array(self.center)
         u = offsets @ self.right / self.meters_per_pixel + 0.5 * (self.width - 1)
         v = 0.5 * (self.height - 1) - offsets[:, 2] / self.meters_per_pixel
         return np.stack([u, v], axis=1)
 
     def depths(self, points: Array) -> Array:
-        """How far from the camera's plane points (n, 3) are, (n,) metres."""
+        """Distances (n,) of points (n, 3) from the camera's plane, metres."""
         return (points - np.array(self.center)) @ self.forward + _AWAY_M
 
 
@@ -142,7 +142,7 @@ def write_text(
 
 
 def text_width(text: str, *, size: int = 14, bold: bool = False) -> int:
-    """How many pixels wide a text is."""
+    """Width of a text in pixels."""
     weight = 600 if bold else 400
     box = cv2.getTextSize((4096, 256), text, (0, 128), cv2.FontFace(_FONT), size, weight)
     return int(box[2])

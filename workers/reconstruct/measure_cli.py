@@ -97,7 +97,7 @@ def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]
 
 
 def _heading(document: dict[str, Any]) -> list[tuple[str, str]]:
-    """What is said before any number: the verdict with its reasons, then the scan."""
+    """Lines before any number: the verdict with its reasons, then the scan."""
     verdict = document.get("verdict", {})
     lines = [("verdict", verdict["status"])] if verdict else []
     lines += [("reason", reason) for reason in verdict.get("reasons", ())]

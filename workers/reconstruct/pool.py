@@ -30,7 +30,7 @@ _RECOVERY_PERIOD_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a job's process ended."""
+    """The end of a job's process."""
 
     delivered: bool
     final: bool

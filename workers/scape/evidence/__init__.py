@@ -1,3 +1,3 @@
-"""What points, images and the floor say about a body: correspondences, outlines, rims, crown.
+"""Evidence about a body in points, images and the floor: correspondences, outlines, rims, crown.
 How the body follows is decided in `workers.scape.fit`.
 """

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _DIRECTION_SCALE_M = 0.04
 """Scale of normals in the search space: opposite normals count as 8 cm of distance."""
 _SEARCHED_EVERY = 4
-"""Of dense points, every so many are searched for; the others start from their results."""
+"""Step between the dense points that are searched for; the others start from their results."""
 _WORTH_A_THREAD = 5000
 """Number of queries from which a second thread saves time."""
 

@@ -1,4 +1,4 @@
-"""Where the body is not: a pixel that shows the booth behind it bounds the silhouette.
+"""Free space: a pixel that shows the booth bounds the silhouette of the body.
 
 For hair, dark cloth and flanks that give no reading it is the only evidence that there is.
 """
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _BEHIND_M = 0.08
-"""How far behind the body the booth must lie at that pixel."""
+"""Least distance of the booth behind the body at that pixel."""
 _MARGIN_PX = 1.5
 """The outline itself flickers by so much."""
 _DEEPEST_PX = 40.0
@@ -34,7 +34,7 @@ class _View:
     inside_px: Image
     """(h, w): distance to the nearest pixel that is not background; 0 elsewhere."""
     slope: tuple[Image, Image]
-    """Of it, along u and v."""
+    """Its derivatives along u and v."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Intrusions:
 
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
-    """What all cameras saw through."""
+    """The free space of all cameras."""
 
     views: tuple[_View, ...]
 

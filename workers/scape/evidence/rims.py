@@ -1,4 +1,4 @@
-"""Where hands end: the rim of what a camera saw before the booth.
+"""The ends of hands, from the rim of the silhouette that a camera saw before the booth.
 
 Readings beside a silhouette have no normal, so the cloud of a finger is thin and ends a centimetre
 short of the tip. But they say where the silhouette is, and there the skin turns away from the
@@ -23,14 +23,14 @@ Array = NDArray[np.float64]
 
 _AROUND_PX = 14
 _AROUND_M = 0.03
-"""How far from the body, as it lies so far, readings may be of it: in the image, and in depth."""
+"""Largest distance of its readings from the body as estimated so far: in the image, in depth."""
 _BEHIND_M = 0.04
-"""How much farther what lies behind a rim must be."""
+"""Least distance between a rim and the surface behind it."""
 _GAP_PX = 2
 """At an edge readings vanish; so near to it there must be one of what lies behind."""
 _SMOOTH_PX = 1.0
 _LEAST_SLOPE = 0.12
-"""Of the smoothed silhouette, per pixel: a straight edge has three times that, a slit between
+"""Least slope of the smoothed silhouette per pixel: a straight edge has three times that, a slit between
 fingers none, and no direction."""
 _LATERAL_PX = 0.8
 """Standard deviation of an edge in the image (Nguyen, Izadi & Lovell 2012)."""

@@ -69,7 +69,7 @@ def add_shape_prior(state: BodyState, normal: Array, gradient: Array, shape: sli
 
 
 def shape_parameters(model: BodyModel, active: int) -> slice:
-    """Where the first `active` shape components are among the parameters."""
+    """Slice of the first `active` shape components among the parameters."""
     return slice(3 * model.part_count, 3 * model.part_count + active)
 
 

@@ -31,18 +31,18 @@ _CUT_M = 0.03
 _DIRECTION_SCALE_M = 0.02
 _MODEL_SHARE = 0.5
 _PRIOR_M = 1e-4
-"""What one squared standard deviation off the prior costs, in metres of mean distance."""
+"""Cost of one squared standard deviation off the prior, in metres of mean distance."""
 _ROUNDS = (96, 64, 48, 32)
 _ELITE = 8
 _CURL = 2.0
-"""What varies most is how far the fingers are closed: people make fists, poses hardly do."""
+"""Scale of the fingers' closing, which varies most: people make fists, training poses hardly do."""
 _SPREAD = 1.25
 """Standard deviations of the prior that the first round spans."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """What the search needs of one side's hand."""
+    """One side's hand as the search needs it."""
 
     side: str
     body: SampledBody

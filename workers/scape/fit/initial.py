@@ -1,4 +1,4 @@
-"""Where the fit starts: height, place, heading and arms from coarse features of the cloud."""
+"""The start of the fit: height, place, heading and arms from coarse features of the cloud."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
 _AROUND_DEG = tuple(float(turn) for turn in range(-180, 180, 24))
 _FEW_ARMS_DEG = (12.0, 39.0, 66.0)
 _FACING_DEG = 36.0
-"""Who is turned by less faces the booth's front."""
+"""A person who is turned by less faces the booth's front."""
 _FEET, _ANKLES = 0.04, (0.06, 0.12)
 """Up to and between which shares of the stature."""
 _TOES_M = 0.01
-"""How far feet reach ahead of their ankles, at the least."""
+"""Least distance by which feet reach ahead of their ankles."""
 _SWINGS_DEG = (-25.0, 0.0, 25.0)
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
 _CLOUD_TRIM_M = 0.48

@@ -1,4 +1,4 @@
-"""Which vertices stand for the body: a few while the fit is coarse, more when it is fine."""
+"""Sample vertices that represent the body: few while the fit is coarse, more when it is fine."""
 
 from __future__ import annotations
 

@@ -250,7 +250,7 @@ class BodyModel:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Of 3x3 matrices (K, 3, 3), by their cofactors: much quicker than a general inverse."""
+    """Inverses of 3x3 matrices (K, 3, 3), by cofactors: much quicker than a general inverse."""
     a, b, c = (matrices[:, i] for i in range(3))
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
     return np.asarray(cofactors / np.einsum("ki,ki->k", a, cofactors[:, :, 0])[:, None, None])

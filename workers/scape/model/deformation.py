@@ -19,7 +19,7 @@ from workers.scape.model import kernels
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 Graph = tuple[NDArray[np.int32], NDArray[np.int32]]
-"""Where each vertex' neighbours begin (P + 1,), and all of them."""
+"""Start of each vertex's neighbours (P + 1,), and all neighbours."""
 
 _PINNED = 0
 """A Laplacian leaves the translation free: this vertex stays where the input has it."""

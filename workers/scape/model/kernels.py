@@ -236,7 +236,7 @@ def descend(points, nodes, first, neighbours, start, square, product):  # type: 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def add_places(blocks, rotations, beta, twists, positions):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """What `add_blocks` adds to the positions alone."""
+    """Add only the positions that `add_blocks` adds."""
     starts, parts, mean, shape, twist_starts, twist_parts, twist_joints, twist_blocks = blocks
     for v in range(len(starts)):
         for block in range(starts[v, 0], starts[v, 1]):

@@ -30,7 +30,7 @@ _TWIST_FLOOR_M = 1.5e-4
 """The same for a radian of a relative twist."""
 _SOLVED_AT_ONCE = 192
 _LAYOUT = 1
-"""Of the cached arrays: another one is built anew."""
+"""Version of the cached arrays: those of another version are built anew."""
 
 
 @dataclass(frozen=True, slots=True)

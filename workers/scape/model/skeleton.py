@@ -37,7 +37,7 @@ def joint_positions(model: BodyModel, vertices: Array, rotations: Array) -> Arra
 
 @lru_cache(maxsize=2)
 def _template_terms(model: BodyModel) -> tuple[Array, Array]:
-    """What takes a body's edges (3K, 3) to its joints less the root's, (L, 3K) by the adjoint
+    """Matrix (L, 3K) from a body's edges (3K, 3) to its joints less the root's, by the adjoint
     solve, and how far the pose-dependent deformation moves them, (L, 3) in the parent's frame."""
     areas = vertex_areas(model.mean, model.faces)
     owners = np.zeros((model.vertex_count, model.part_count))

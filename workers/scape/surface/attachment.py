@@ -49,7 +49,7 @@ def attached(
 
 @lru_cache(maxsize=2)
 def _triangles_around(model: BodyModel) -> tuple[Index, Index]:
-    """Where each vertex's triangles begin (P + 1,), and all of them (3 K,)."""
+    """Start of each vertex's triangles (P + 1,), and all triangles (3 K,)."""
     corners = model.faces.ravel()
     first = np.zeros(model.vertex_count + 1, np.int64)
     np.cumsum(np.bincount(corners, minlength=model.vertex_count), out=first[1:])

@@ -96,7 +96,7 @@ class _Readings:
     information: Array
     """(n,): inverse variance, times the share that is independent."""
     of_cloud: int
-    """How many are the cloud's. A rim says where the skin ends, not that a camera saw it."""
+    """Number of points of the cloud. A rim says where the skin ends, not that a camera saw it."""
     tracked: TrackedPoints
 
     @classmethod
@@ -139,7 +139,7 @@ class _Readings:
 
 @dataclass(frozen=True, slots=True)
 class _AtVertices:
-    """What the cloud says at the vertices next to its points. P vertices."""
+    """The cloud's evidence at the vertices next to its points. P vertices."""
 
     residual_m: Array
     """(P,): mean distance of the vertex's points; 0 where it has none."""

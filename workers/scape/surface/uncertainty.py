@@ -1,4 +1,4 @@
-"""How far the surface may be off at each vertex, from what this scan itself shows.
+"""The uncertainty of the surface at each vertex, from the scan itself.
 
 Three things add up: the noise of the readings, a share of the mismatch between the person and the
 model that is left even where readings are, and, where there are none, the field that nobody
