@@ -30,8 +30,8 @@ _GAP_PX = 2
 """At an edge readings vanish; so near to it there must be one of what lies behind."""
 _SMOOTH_PX = 1.0
 _LEAST_SLOPE = 0.12
-"""Least slope of the smoothed silhouette per pixel: a straight edge has three times that, a slit between
-fingers none, and no direction."""
+"""Least slope of the smoothed silhouette per pixel: a straight edge has three times that, a slit
+between fingers has none, and no direction."""
 _LATERAL_PX = 0.8
 """Standard deviation of an edge in the image (Nguyen, Izadi & Lovell 2012)."""
 
