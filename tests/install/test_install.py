@@ -107,6 +107,7 @@ def test_three_commands_lead_to_the_first_scan(
     machine.put(recordings, RECORDINGS, owner="booth:")
     began_s = time.monotonic()
     setup = machine.run("station", "setup", "--recordings", RECORDINGS)
+    assert "the console's password, shown this once" in setup.stdout
     assert "ready: station scan" in setup.stdout
     _scan(machine, "first")
     seconds = installed_s + time.monotonic() - began_s
@@ -120,6 +121,16 @@ def test_setup_again_changes_nothing(machine: Machine) -> None:
     before = _kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)}
     assert ", kept" in machine.run("station", "setup").stdout
     assert before == (_kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)})
+
+
+def test_the_console_answers_and_asks_for_the_password(machine: Machine) -> None:
+    fetch = (
+        "import urllib.request as r; "
+        "print(r.urlopen('http://127.0.0.1:8420/').status); r.urlopen('http://127.0.0.1:8420/api/v1/booth')"
+    )
+    answered = machine.run("/opt/booth/bin/python", "-c", fetch, check=False)
+    assert answered.stdout.strip() == "200"
+    assert "HTTP Error 401" in answered.stderr
 
 
 def test_systemd_finds_nothing_wrong_with_the_installed_units(machine: Machine) -> None:
