@@ -1,6 +1,6 @@
-"""Free space: a pixel that shows the booth bounds the silhouette of the body.
+"""Free space: pixels that show the booth bound the body's silhouette.
 
-For hair, dark cloth and flanks that give no reading it is the only evidence that there is.
+For hair, dark cloth and flanks that give no readings this is the only evidence.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _BEHIND_M = 0.08
-"""Least distance of the booth behind the body at that pixel."""
+"""Least distance from the body to the booth behind it."""
 _MARGIN_PX = 1.5
-"""The outline itself flickers by so much."""
+"""Flicker of the outline, which does not count."""
 _DEEPEST_PX = 40.0
-"""Farther inside the background something else is wrong: a limb must be found, not pulled."""
+"""Distance from the outline beyond which a vertex is not moved: the limb is elsewhere."""
+_LEAST_SLOPE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,23 +35,23 @@ class _View:
     inside_px: Image
     """(h, w): distance to the nearest pixel that is not background; 0 elsewhere."""
     slope: tuple[Image, Image]
-    """Its derivatives along u and v."""
+    """Derivatives of `inside_px` along u and v."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intrusions:
-    """Vertices that stand where a camera saw through."""
+    """Vertices at pixels where a camera saw the booth behind them."""
 
     vertex: NDArray[np.intp]
     direction: Array
-    """(n, 3): unit, out of the body's silhouette."""
+    """(n, 3): unit vectors out of the body's silhouette."""
     depth_m: Array
-    """(n,): how far each would have to go back against it."""
+    """(n,): distance by which each has to move in the opposite direction."""
 
 
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
-    """The free space of all cameras."""
+    """Background of all cameras."""
 
     views: tuple[_View, ...]
 
@@ -61,8 +62,11 @@ class FreeSpace:
             return cls(tuple(found))
 
     def intrusions(self, poses: Sequence[Array], vertices: Array) -> Intrusions:
-        """The vertices (P, 3) among which a camera saw the booth behind, once a camera; world from
-        camera (4, 4) as the cameras' corrections have it.
+        """Intruding vertices of a body, once for each camera.
+
+        Args:
+            poses: corrected world_from_camera (4, 4) of each camera.
+            vertices: (P, 3).
         """
         found = [
             _intrusions(view, pose, vertices) for view, pose in zip(self.views, poses, strict=True)
@@ -100,7 +104,7 @@ def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
     wrong = behind & (deep > _MARGIN_PX) & (deep < _DEEPEST_PX)
     vertex, u, v, deep = vertex[wrong], u[wrong], v[wrong], deep[wrong]
     slope = np.stack([view.slope[0][v, u], view.slope[1][v, u]], axis=1).astype(np.float64)
-    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
+    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), _LEAST_SLOPE)
     axes = pose[:3, :2]
     return Intrusions(
         vertex,

@@ -1,9 +1,9 @@
-"""The ends of hands, from the rim of the silhouette that a camera saw before the booth.
+"""Rims of the hands: oriented points on their silhouettes.
 
-Readings beside a silhouette have no normal, so the cloud of a finger is thin and ends a centimetre
-short of the tip. But they say where the silhouette is, and there the skin turns away from the
-camera: its normal is square to the ray and to the outline (the contour generator of Cipolla &
-Blake 1992). A place and a normal are all that the fit needs to know of a point.
+Readings near a silhouette have no normals, so the cloud of a finger is thin and ends a centimetre
+before its tip. But they show where the silhouette is, and there the skin turns away from the
+camera: its normal is perpendicular to the ray and to the outline (the contour generator of Cipolla
+& Blake 1992). With position and normal, these points are used like those of the cloud.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ Array = NDArray[np.float64]
 
 _AROUND_PX = 14
 _AROUND_M = 0.03
-"""Largest distance of its readings from the body as estimated so far: in the image, in depth."""
+"""Distance from the present body within which readings can belong to it: in the image, in depth."""
 _BEHIND_M = 0.04
-"""Least distance between a rim and the surface behind it."""
+"""Least distance from a rim to what lies behind it."""
 _GAP_PX = 2
-"""At an edge readings vanish; so near to it there must be one of what lies behind."""
+"""Width of the gap without readings at an edge, behind which the background must be seen."""
 _SMOOTH_PX = 1.0
+"""Standard deviation of the filter that smooths the silhouette."""
 _LEAST_SLOPE = 0.12
-"""Least slope of the smoothed silhouette per pixel: a straight edge has three times that, a slit
-between fingers has none, and no direction."""
+"""Least slope of the smoothed silhouette per pixel: a straight edge has three times as much, a slit
+between fingers none."""
 _LATERAL_PX = 0.8
 """Standard deviation of an edge in the image (Nguyen, Izadi & Lovell 2012)."""
 
@@ -39,9 +40,15 @@ _LATERAL_PX = 0.8
 def rims_of(
     views: Sequence[CameraView], camera_names: tuple[str, ...], bodies: Sequence[Array]
 ) -> PointCloud:
-    """In all views, of bodies of which vertices (m, 3) are known by a few centimetres.
+    """Rims of some bodies in all views.
 
-    The normals look outwards, square to the rays; sigma_m is that along them.
+    Args:
+        camera_names: names that the cloud's camera indices refer to.
+        bodies: vertices (m, 3) of each body, known to within a few centimetres.
+
+    Returns:
+        Points on the rims, with normals that point outwards, perpendicular to the rays, and the
+        standard deviations along these normals.
     """
     nothing = np.empty((0, 3))
     rims, cameras = [(nothing, nothing, np.empty(0))], [0]
@@ -61,7 +68,7 @@ def _rim(view: CameraView, vertices: Array) -> tuple[Array, Array, Array]:
     if not depth.size:
         return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     nearest, farthest = local[:, 2].min() - _AROUND_M, local[:, 2].max() + _AROUND_M
-    # What is nearer than the body hides its rim: it counts as inside, and its own rim is left out.
+    # Nearer objects hide the rim: they count as inside, and their own rims are left out.
     inside = ((depth > 0) & (depth < farthest)).astype(np.uint8)
     edge = (inside > cv2.erode(inside, _square(1))) & (depth > nearest)
     edge &= cv2.dilate(depth, _square(_GAP_PX)) - depth > _BEHIND_M
@@ -81,8 +88,10 @@ def _square(reach_px: int) -> NDArray[np.uint8]:
 
 
 def _window(view: CameraView, local: Array) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Corner (u, v) and depths of the image around vertices (m, 3) in the camera's frame; nothing
-    where one is behind the camera."""
+    """Corner (u, v) and depths of the image around vertices (m, 3) in the camera's frame.
+
+    Empty where a vertex is behind the camera.
+    """
     pixels = project(view.calibration, local)
     if np.isnan(pixels).any():
         return np.zeros(2, np.intp), view.depth_m[:0]
@@ -98,10 +107,10 @@ def _lifted(
     outwards: Array,
     depth_m: NDArray[np.float32],
 ) -> tuple[Array, Array, Array]:
-    """Edge pixels (2, n) and the outline's normals (n, 2) there as oriented points of the world."""
+    """Oriented points of the world from edge pixels (2, n) and normals (n, 2) of the outline."""
     focal = np.diag(calibration.K)[:2]
     ray = rays(calibration)[pixels[1], pixels[0]].astype(np.float64)
-    # The edge runs along the pixel's outer border.
+    # The edge is at the outer border of the pixel.
     ray[:, :2] += 0.5 * outwards / focal
     across = outwards * focal
     normals = np.column_stack([across, -np.einsum("ni,ni->n", across, ray[:, :2])])

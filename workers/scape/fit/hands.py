@@ -1,7 +1,8 @@
-"""Hands: small, thin and quick to turn, so that descending from one guess loses every third.
+"""Search for the pose of the hands, which are too small and thin for a descent from one guess.
 
-A cross-entropy search (Rubinstein 1999) over the twists of hand, thumb and fingers, from their
-prior, against the points beyond the wrist; everything else of the body stays where it is.
+A cross-entropy search (Rubinstein 1999) over the twists of hand, thumb and fingers samples them
+from their prior and compares them with the points beyond the wrist; the rest of the body is fixed.
+Descending from one guess alone loses every third hand.
 """
 
 from __future__ import annotations
@@ -21,44 +22,56 @@ from workers.scape.model.spread import farthest_first
 
 Array = NDArray[np.float64]
 
-_SAMPLES = 130
-_POINTS = 260
+_SAMPLES, _POINTS = 130, 260
+"""Vertices of a hand, and points of the cloud, that are compared."""
 _LEAST_POINTS = 25
+"""Points below which a hand stays as it is."""
 _REACH_M = 0.23
+"""Radius around the wrist within which points can belong to the hand: the longest hands."""
 _BEHIND_WRIST_M = 0.015
+"""Distance towards the elbow up to which points count."""
 _FOREIGN_M = 0.025
+"""Distance to another part's surface beyond which a point is not that part's."""
 _CUT_M = 0.03
+"""Largest distance that counts, so that stray points cost no more."""
 _DIRECTION_SCALE_M = 0.02
+"""Scale of normals against positions: opposite normals count as 4 cm."""
 _MODEL_SHARE = 0.5
+"""Weight of the distances from the hand to the cloud: a part of the hand is not seen."""
 _PRIOR_M = 1e-4
-"""Cost of one squared standard deviation off the prior, in metres of mean distance."""
+"""Cost of one squared standard deviation from the prior, in metres of mean distance."""
 _ROUNDS = (96, 64, 48, 32)
+"""Poses that are tried in each round."""
 _ELITE = 8
+"""Best poses of a round, whose mean and spread the next round samples from."""
+_LEAST_SPREAD = 0.02
+"""Added to this spread, in standard deviations, so that the search does not freeze."""
 _CURL = 2.0
-"""Scale of the fingers' closing, which varies most: people make fists, training poses hardly do."""
+"""Factor of the prior's widest direction, the closing of the fingers: people make fists, the
+training poses hardly do."""
 _SPREAD = 1.25
-"""Standard deviations of the prior that the first round spans."""
+"""Spread of the first round, in standard deviations of the prior."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """One side's hand as the search needs it."""
+    """One hand of the model, prepared for the search."""
 
     side: str
     body: SampledBody
     parts: tuple[int, ...]
-    """hand, thumb, fingers; every one after its parent."""
+    """Indices of hand, thumb and fingers, each after its parent."""
     forearm: int
     owner: NDArray[np.int32]
-    """(n,): the part of each sample."""
+    """(n,): part of each sample."""
     mean: Array
     """(9,): prior twists of the parts, radians."""
     spread: Array
-    """(9, 9): a square root of their covariance, wider the way fingers close."""
+    """(9, 9): square root of their covariance, widened in the direction in which fingers close."""
 
 
 def hands_of(model: BodyModel) -> tuple[Hand, ...]:
-    """Both hands, their samples spread evenly."""
+    """Both hands, with evenly spread samples."""
     return tuple(_hand(model, side) for side in ("left", "right"))
 
 
@@ -90,7 +103,12 @@ def place_hands(
     vertices: Array,
     normals: Array,
 ) -> BodyState:
-    """The state with both hands turned and closed as the points beyond the wrists say."""
+    """State with both hands posed to match the points beyond the wrists.
+
+    Args:
+        vertices: (P, 3), the body in that state.
+        normals: (P, 3), its normals.
+    """
     tree = OrientedTree.build(vertices, normals)
 
     def searched(hand: Hand) -> BodyState:
@@ -109,7 +127,7 @@ def place_hands(
 def _beyond_wrist(
     model: BodyModel, hand: Hand, cloud: OrientedTree, vertices: Array, tree: OrientedTree
 ) -> tuple[Array, Array]:
-    """Oriented points (n, 3) that can be the hand's: near it, and not the thigh's."""
+    """Oriented points (n, 3) that can belong to the hand: near it, and not to the thigh."""
     weights = model.vertex_weights
     ring = weights[:, hand.forearm] * weights[:, hand.parts[0]]
     wrist = ring @ vertices / ring.sum()
@@ -138,7 +156,7 @@ def _searched(
     directions: Array,
 ) -> BodyState:
     tries = _Tries.build(model, hand, state, normals[hand.body.indices])
-    # Standard coordinates: the prior is N(0, I) in them.
+    # In these coordinates the prior is N(0, I).
     inverse = np.linalg.pinv(hand.spread, rcond=1e-3)
     found = inverse @ (tries.twists - hand.mean)
     cloud = np.concatenate([points, _DIRECTION_SCALE_M * directions], axis=1).astype(np.float32)
@@ -156,7 +174,7 @@ def _searched(
         if cost[order[0]] < least:
             best, least = tried[order[0]], float(cost[order[0]])
         elite = tried[order[:_ELITE]]
-        center, width = elite.mean(axis=0), elite.std(axis=0) + 0.02
+        center, width = elite.mean(axis=0), elite.std(axis=0) + _LEAST_SPREAD
     rotations = _rotations(model, hand, state, (hand.mean + hand.spread @ best)[None])
     turned = state.rotations.copy()
     turned[list(hand.parts)] = rotations[0]
@@ -180,22 +198,22 @@ def _rotations(model: BodyModel, hand: Hand, state: BodyState, twists: Array) ->
 
 @dataclass(frozen=True, slots=True)
 class _Tries:
-    """The samples of one hand as functions of its parts' twists; the rest of the body is kept.
+    """Samples of one hand as functions of its parts' twists; the rest of the body is fixed.
 
-    B_p of the parts that the search does not turn enters turned, summed up as one arm.
+    Contributions B_p of the parts that stay fixed are rotated once and summed up.
     """
 
     state: BodyState
     twists: Array
-    """(9,): as the body has them now."""
+    """(9,): present twists."""
     still: Array
-    """(n, 4, 3): B_p of hand, thumb and fingers, then the others' sum."""
+    """(n, 4, 3): B_p of hand, thumb and fingers, and the sum of the others."""
     change: Array
-    """(n 4 3, 9): of it, with the twists."""
+    """(n 4 3, 9): derivative of `still` by the twists."""
     normals: Array
-    """(n, 3): in the parts' own frames."""
+    """(n, 3): normals in the frames of their parts."""
     members: tuple[NDArray[np.intp], ...]
-    """The samples of each part."""
+    """Indices of each part's samples."""
 
     @classmethod
     def build(cls, model: BodyModel, hand: Hand, state: BodyState, normals: Array) -> _Tries:
@@ -221,8 +239,12 @@ class _Tries:
         )
 
     def posed(self, rotations: Array, twists: Array) -> NDArray[np.float32]:
-        """(h, 6, n): the samples and their scaled normals for rotations (h, 3, 3, 3) of the parts
-        and twists (h, 9)."""
+        """Positions and scaled normals (h, 6, n) of the samples for h poses.
+
+        Args:
+            rotations: (h, 3, 3, 3), of the three parts.
+            twists: (h, 9).
+        """
         count, tries = len(self.still), len(twists)
         arms = (self.change @ (twists - self.twists).T).T.reshape(tries, count, 4, 3) + self.still
         turning = np.concatenate(

@@ -1,4 +1,4 @@
-"""The start of the fit: height, place, heading and arms from coarse features of the cloud."""
+"""Starting states of the fit: stature, position, heading and arms from a coarse cloud."""
 
 from __future__ import annotations
 
@@ -16,26 +16,40 @@ from workers.scape.model.sampled import SampledBody
 Array = NDArray[np.float64]
 
 _NEUTRAL_ARM_DEG = 43.0
+"""Angle between the trunk and the arms of the neutral pose."""
 _ARMS_DEG = (12.0, 30.0, 48.0, 66.0, 84.0)
 _HEADINGS_DEG = (-24.0, -12.0, 0.0, 12.0, 24.0)
+_SWINGS_DEG = (-25.0, 0.0, 25.0)
+"""Angles that are tried: arms from the trunk, headings, arms swung back."""
 _AROUND_DEG = tuple(float(turn) for turn in range(-180, 180, 24))
 _FEW_ARMS_DEG = (12.0, 39.0, 66.0)
+"""Headings and arms that are tried to find the rough heading."""
+_GIRDLE_SHARE = 0.15
+"""Share of an arm's angle that the shoulder takes; the upper arm takes the rest."""
 _FACING_DEG = 36.0
-"""A person who is turned by less faces the booth's front."""
+"""A person who is turned by less faces the front of the booth."""
 _FEET, _ANKLES = 0.04, (0.06, 0.12)
-"""Up to and between which shares of the stature."""
+"""Heights of feet (at most) and ankles, as shares of the stature."""
 _TOES_M = 0.01
-"""Least distance by which feet reach ahead of their ankles."""
-_SWINGS_DEG = (-25.0, 0.0, 25.0)
+"""Least distance by which feet extend in front of their ankles."""
 _STRAIGHTER_ELBOW_RAD = np.radians(22.0)
+"""Angle by which elbows are straightened from the neutral pose."""
 _CLOUD_TRIM_M = 0.48
-"""Points of an arm that hangs at the wrong angle must tell: a hand is off by that much."""
+"""Largest distance that counts of a point: that of a hand when the arm's angle is wrong."""
 _BODY_TRIM_M = 0.08
+"""Largest distance that counts of a vertex: not all of the body is seen."""
 _STATURE_COMPONENTS = 40
-"""The first ones hold nearly all of it, and fewer are quicker to evaluate."""
+"""Shape components that are used for the stature: they hold nearly all of it."""
+_MOST_BETA_NORM = 3.5
+"""Largest length of beta at the start."""
+_STATURE_QUANTILE = 0.9995
+"""Quantile of the points' heights that is taken for the stature."""
+_TRUNK_HEIGHTS = (0.35, 0.75)
+"""Heights of the trunk, as shares of the stature."""
+_LEAST_TRUNK_POINTS = 50
 
 _Try = tuple[tuple[float, float], tuple[float, float], float]
-"""Degrees: of the arms from the trunk and of their swing back (left, right), of the heading."""
+"""Degrees: arms from the trunk (left, right), arms swung back (left, right), heading."""
 
 
 def posed(
@@ -45,8 +59,13 @@ def posed(
     swing_deg: tuple[float, float],
     heading_deg: float,
 ) -> BodyState:
-    """A state with arms (left, right) so many degrees from the trunk and so many behind it, turned
-    about the vertical."""
+    """State with other arms and another heading.
+
+    Args:
+        arm_deg: angles of the arms from the trunk (left, right).
+        swing_deg: angles of the arms behind the trunk (left, right).
+        heading_deg: rotation about the vertical.
+    """
     names = list(model.part_names)
     twists = np.zeros((model.part_count, 3))
     twists[0, 2] = np.radians(heading_deg)
@@ -54,16 +73,16 @@ def posed(
         ("left", "right"), (1.0, -1.0), arm_deg, swing_deg, strict=True
     ):
         lower = sign * np.radians(_NEUTRAL_ARM_DEG - angle)
-        twists[names.index(f"shoulder_{side}"), 1] = 0.15 * lower
+        twists[names.index(f"shoulder_{side}"), 1] = _GIRDLE_SHARE * lower
         twists[names.index(f"upper_arm_{side}"), 0] = np.radians(swing)
-        twists[names.index(f"upper_arm_{side}"), 1] = 0.85 * lower
+        twists[names.index(f"upper_arm_{side}"), 1] = (1.0 - _GIRDLE_SHARE) * lower
         straighter = np.array([0.7, 0.1 * sign, 0.7 * sign]) * _STRAIGHTER_ELBOW_RAD
         twists[names.index(f"forearm_{side}")] = straighter
     return replace(state, rotations=model.absolute_rotations(twists))
 
 
 def stature_beta(model: BodyModel, stature_m: float) -> Array:
-    """The likeliest shape of a stature: the smallest beta that gives it (conditional normal)."""
+    """Most likely shape of a stature: the shortest beta that gives it (conditional normal)."""
     top = model.landmarks["crown"]
     sole = int(np.argmin(model.mean[:, 2]))
     gradient = (model.directions[:, top, 2] - model.directions[:, sole, 2]).astype(np.float64)
@@ -71,22 +90,28 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
     excess = stature_m - float(model.mean[top, 2] - model.mean[sole, 2])
     beta = gradient * excess / float(gradient @ gradient)
     norm = float(np.linalg.norm(beta))
-    return beta * min(1.0, 3.5 / max(norm, 1e-9))
+    return beta * min(1.0, _MOST_BETA_NORM / max(norm, 1e-9))
 
 
 def starting_states(
     model: BodyModel, scout: SampledBody, points: Array, cloud: Array
 ) -> list[BodyState]:
-    """States to start from, best first, judged on a coarse sample (n, 3) of a cloud (m, 3).
+    """Starting states, best first.
 
-    First where the person roughly looks; then both arms at one angle and all headings about that,
-    then each arm alone at the best heading, then each arm swung forward and back.
+    The search first finds the rough heading, then the heading with both arms at one angle, then the
+    angle of each arm, then their swing forward or back.
+
+    Args:
+        scout: a few vertices of the model.
+        points: (n, 3), a coarse subset of the cloud.
+        cloud: (m, 3), a denser one that shows the feet.
     """
-    stature = float(np.quantile(points[:, 2], 0.9995))
+    stature = float(np.quantile(points[:, 2], _STATURE_QUANTILE))
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
-    trunk = points[(points[:, 2] > 0.35 * stature) & (points[:, 2] < 0.75 * stature)]
-    center = np.median(trunk if len(trunk) > 50 else points, axis=0)
-    # What bends the surface a little with the pose is left out here.
+    low, high = (share * stature for share in _TRUNK_HEIGHTS)
+    trunk = points[(points[:, 2] > low) & (points[:, 2] < high)]
+    center = np.median(trunk if len(trunk) > _LEAST_TRUNK_POINTS else points, axis=0)
+    # The pose-dependent deformation is neglected here.
     arms, _ = scout.arms(state, ())
 
     def scored(tried: list[_Try]) -> tuple[Array, list[BodyState]]:
@@ -112,11 +137,11 @@ def starting_states(
 
 
 def facing_deg(heading_deg: float, cloud: Array, stature_m: float) -> float:
-    """A heading or its opposite, which a coarse body can hardly tell apart: toes point ahead.
+    """Heading or its opposite, by the direction of the toes: coarse bodies look alike in both.
 
     Args:
-        heading_deg: about z from -y.
-        cloud: (m, 3), standing on z = 0.
+        heading_deg: rotation about z from -y.
+        cloud: (m, 3), floor at z = 0.
     """
     height = cloud[:, 2] / stature_m
     feet = cloud[height < _FEET, :2]
@@ -126,7 +151,7 @@ def facing_deg(heading_deg: float, cloud: Array, stature_m: float) -> float:
     if len(feet) and len(ankles):
         own = cKDTree(ankles).query(feet)[1]
         ahead = float((feet - ankles[own]).mean(axis=0) @ (np.sin(turn), -np.cos(turn)))
-    # Feet that do not tell leave the booth's front.
+    # Where the feet do not show it, the person faces the front of the booth.
     away = ahead < 0.0 if abs(ahead) > _TOES_M else np.cos(turn) < 0.0
     facing = (heading_deg + (360.0 if away else 180.0)) % 360.0 - 180.0
     return 0.0 if abs(facing) < _FACING_DEG else facing
@@ -139,7 +164,7 @@ def _placed(
     states: list[BodyState],
     center: Array,
 ) -> tuple[Array, list[BodyState]]:
-    """Bodies (c, n, 3) over the cloud's center with their soles on the floor, and their states."""
+    """Bodies (c, n, 3) at the center of the cloud, soles on the floor, and their states."""
     rotations = np.stack([state.rotations for state in states])
     bodies = np.einsum("cpij,npj->cni", rotations, arms.astype(np.float64), optimize=True)
     trunk = np.isin(model.part_of_vertex[scout.indices], (0, 1, 2))
@@ -152,7 +177,7 @@ def _placed(
 
 
 def _costs(bodies: Array, points: Array) -> Array:
-    """Trimmed two-way distances: the cloud must be explained, the body need not all be seen."""
+    """Trimmed two-way distances: all points should lie on the body, which is not all seen."""
     found = trimmed_costs(
         np.ascontiguousarray(bodies.swapaxes(1, 2), np.float32),
         points.astype(np.float32),

@@ -1,4 +1,4 @@
-"""The paper's algorithm as it stands (Zhou et al. 2013), for comparison.
+"""The algorithm of the paper (Zhou et al. 2013), for comparison with the joint fit.
 
 Iterate until Y' stops changing: (a) correspondences and rigid alignment until the pairs settle,
 (b) pose and shape by SCAPE's quadratic energies in turn, (c) the mesh that minimises
@@ -27,10 +27,14 @@ MAX_CORRESPONDENCE_DISTANCE_M = 0.05
 MAX_NORMAL_ANGLE_RAD = np.radians(15.0)
 SURFACE_WEIGHT = 1.0
 _MOST_ITERATIONS = 10
+"""Iterations of the whole loop; the paper uses ten."""
 _MOST_ALIGNMENTS = 20
+"""Repetitions of step (a)."""
 _SETTLED_M = 5e-4
+"""Rms change of the mesh below which the loop ends."""
 _LEAST_PAIRS = 50
 _SHAPE_RIDGE = 1e-3
+"""Ridge of the shape's energy, as a share of its mean diagonal."""
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Vertices and the points that they belong to."""
@@ -43,7 +47,7 @@ def fit_like_the_paper(
     progress: Callable[[float], None] = lambda share: None,  # noqa: ARG005
     observer: Observer = unobserved,
 ) -> tuple[SurfaceFit, BodyState, int]:
-    """The paper's loop; returns the surface, the last state and how often it went round."""
+    """The paper's loop; returns the surface, the last state and the number of iterations."""
     mesh = model.vertices(state)
     iteration = 0
     for iteration in range(1, _MOST_ITERATIONS + 1):
@@ -77,7 +81,7 @@ def fit_like_the_paper(
 
 
 def find_pairs(model: BodyModel, target: Target, mesh: Array) -> Pairs:
-    """Step (a): each vertex' nearest point, nearer than 5 cm and within 15 degrees."""
+    """Step (a): nearest point of each vertex, closer than 5 cm and within 15 degrees."""
     normals = vertex_normals(mesh, model.faces)
     point = target.tree.nearest(mesh, normals)
     kept = compatible(
@@ -91,11 +95,13 @@ def find_pairs(model: BodyModel, target: Target, mesh: Array) -> Pairs:
 
 
 def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array, Pairs]:
-    """Step (a), repeated: the mesh moves as one piece until its pairs settle."""
+    """Step (a), repeated: rigid motion of the mesh until its pairs no longer change."""
     pairs = find_pairs(model, target, mesh)
     for _ in range(_MOST_ALIGNMENTS):
         if len(pairs[0]) < _LEAST_PAIRS:
-            raise InputError("the paper's method finds no start on this cloud; use --method joint")
+            raise InputError(
+                "the paper's method finds no match with this cloud; use --method joint"
+            )
         mesh = transform(rigid_fit(target.tree.points[pairs[1]], mesh[pairs[0]]), mesh)
         found = find_pairs(model, target, mesh)
         settled = len(found[0]) == len(pairs[0]) and np.array_equal(found[1], pairs[1])
@@ -106,14 +112,14 @@ def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array,
 
 
 def solve_pose_and_shape(model: BodyModel, mesh: Array, pairs: Pairs, target: Target) -> BodyState:
-    """Step (b): theta, then beta, each by its own quadratic energy, for the mesh at its pairs."""
+    """Step (b): theta, then beta, each by its own energy, for the mesh moved to its pairs."""
     goal = mesh.copy()
     goal[pairs[0]] = target.tree.points[pairs[1]]
     return model.project(goal, iterations=2, ridge=_SHAPE_RIDGE)
 
 
 def solve_mesh(model_mesh: Array, pairs: Pairs, target: Target) -> Array:
-    """Step (c): E(Y') couples no two vertices, so its minimum is a weighted mean for each."""
+    """Step (c): E(Y') does not couple vertices, so its minimum is a weighted mean at each."""
     mesh = model_mesh.copy()
     vertex, point = pairs
     mesh[vertex] = (mesh[vertex] + SURFACE_WEIGHT * target.tree.points[point]) / (

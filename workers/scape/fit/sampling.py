@@ -1,4 +1,4 @@
-"""Sample vertices that represent the body: few while the fit is coarse, more when it is fine."""
+"""Sample vertices that represent the body: a few while the fit is coarse, more when it is fine."""
 
 from __future__ import annotations
 
@@ -18,57 +18,61 @@ from workers.scape.model.spread import farthest_first
 Array = NDArray[np.float64]
 
 COARSE_SAMPLES, FINE_SAMPLES = 600, 2000
-_SCOUTS = 1200
+"""Vertices whose derivatives are computed."""
+_COARSE_PLACES = 1200
+"""Vertices that represent the surface while the fit is coarse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Nested sample vertices with the model's derivatives, and who stands for whom."""
+    """Nested sample vertices with the model's derivatives, and which vertices they represent."""
 
     body: SampledBody
-    scouts: SampledBody
-    """The first ones: all the skin that the coarse stages look at."""
+    coarse_body: SampledBody
+    """The first of these vertices: the surface in the coarse steps."""
     normals: Array
-    """(m, 3): of the scouts, on the mean body."""
+    """(m, 3): normals of the coarse body's vertices on the mean body."""
     share: Array
-    """(m,): the area that each scout stands for, in those of an average vertex."""
-    coarse_of_scout: NDArray[np.intp]
+    """(m,): area that each of them represents, in units of an average vertex's."""
+    coarse_sample: NDArray[np.intp]
+    """(m,): the coarse sample nearest to each of them."""
     sample_of_vertex: NDArray[np.intp]
+    """(P,): the sample nearest to each vertex."""
     hands: tuple[Hand, ...]
 
     @classmethod
     def build(cls, model: BodyModel) -> Sampling:
-        """Samples spread evenly; the first ones alone are spread evenly too."""
+        """Evenly spread samples, of which the first ones alone are evenly spread too."""
         order = _spread(model)
         places = model.mean[order]
-        scouts = places[:_SCOUTS]
-        scout_of_vertex = cKDTree(scouts).query(model.mean)[1]
+        coarse = places[:_COARSE_PLACES]
+        coarse_of_vertex = cKDTree(coarse).query(model.mean)[1]
         body = SampledBody.build(model, order)
         return cls(
             body,
-            body.first(_SCOUTS),
-            vertex_normals(model.mean, model.faces)[order[:_SCOUTS]],
-            np.bincount(scout_of_vertex, model.vertex_shares, _SCOUTS).astype(np.float64),
-            cKDTree(places[:COARSE_SAMPLES]).query(scouts)[1],
+            body.first(_COARSE_PLACES),
+            vertex_normals(model.mean, model.faces)[order[:_COARSE_PLACES]],
+            np.bincount(coarse_of_vertex, model.vertex_shares, _COARSE_PLACES).astype(np.float64),
+            cKDTree(places[:COARSE_SAMPLES]).query(coarse)[1],
             cKDTree(places).query(model.mean)[1],
             hands_of(model),
         )
 
     def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
-        """The scouts, their normals turned with the parts."""
-        index = self.scouts.indices
+        """Skin of the coarse steps; its normals are rotated with the parts."""
+        index = self.coarse_body.indices
         turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
         normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
         return Skin(
-            self.scouts.evaluate(state),
+            self.coarse_body.evaluate(state),
             normals / np.linalg.norm(normals, axis=1, keepdims=True),
             model.part_of_vertex[index],
             self.share,
-            self.coarse_of_scout,
+            self.coarse_sample,
         )
 
     def skin(self, model: BodyModel, state: BodyState) -> Skin:
-        """Every vertex."""
+        """Skin of the fine steps: every vertex."""
         vertices = model.vertices(state)
         return Skin(
             vertices,
@@ -80,8 +84,10 @@ class Sampling:
 
 
 def _spread(model: BodyModel) -> NDArray[np.int64]:
-    """Farthest-point order on the mean body, started from a fixed vertex; the soles' and the
-    face's folds count by area, so that neither takes all the samples."""
+    """Order of vertices, each the farthest from those before it on the mean body.
+
+    Vertices of small area wait, so that folds of soles and face do not take all the samples.
+    """
     areas = np.sqrt(vertex_areas(model.mean, model.faces))
     reach = np.minimum(areas / np.median(areas), 1.0)
     return farthest_first(model.mean, FINE_SAMPLES, start=model.landmarks["crown"], reach=reach)
