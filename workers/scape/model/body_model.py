@@ -1,13 +1,13 @@
-"""The SCAPE body model: a body from pose and shape, its derivatives, and the way back.
+"""The SCAPE body model: vertices from pose and shape, and pose and shape from vertices.
 
 After Anguelov et al. 2005, with blended part rotations: the edge e of triangle k becomes
 
     (sum_p w_kp R_p) (e of the neutral surface X(beta, theta)),
     X = mean + sum_j beta_j U_j + sum_m twist_m C_m        (C: the pose-dependent deformation Q)
 
-and the vertices are those whose edges come nearest. The solve is linear and acts on each coordinate
-alone, so a part's rotation passes through it: Y = sum_p R_p B_p(X) + t. `at` keeps B for sample
-vertices; the full body takes one sparse solve.
+and the vertices are those whose edges are nearest to these in least squares. The solution is linear
+and the same for each coordinate, so a part's rotation passes through it: Y = sum_p R_p B_p(X) + t.
+`SampledBody` keeps B for sample vertices; the whole body takes one sparse solution.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ VERSIONS = frozenset({1})
 SHIPPED = "data/body.npz"
 
 HAND = ("hand", "thumb", "fingers")
-"""The parts that a hand is made of, every one after its parent."""
+"""Parts of a hand, each after its parent."""
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -50,19 +50,19 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class BodyState:
-    """A body's parameters."""
+    """Parameters of a body."""
 
     rotations: Array
-    """(L, 3, 3): world from neutral, of each part, absolute."""
+    """(L, 3, 3): rotation of each part from the neutral pose to the world."""
     beta: Array
     """(B,): shape, in standard deviations of the training bodies."""
     translation: Array
-    """(3,): where the pelvis' centroid is, metres."""
+    """(3,): position of the pelvis' centroid, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A learned model. L parts, P vertices, K triangles, B shape components."""
+    """Learned model of L parts, P vertices, K triangles and B shape components."""
 
     name: str
     sha256: str
@@ -81,9 +81,9 @@ class BodyModel:
     """(3 (L - 1), P, 3): C_m, displacement by one radian of each relative twist."""
     landmarks: dict[str, int]
     symmetry: NDArray[np.int32]
-    """(P,): the vertex on the other side."""
+    """(P,): index of the mirrored vertex."""
     vertex_sigma_m: Array
-    """(P,): standard deviation of what the components leave out on held-out bodies."""
+    """(P,): standard deviation of the components' residual on held-out bodies."""
     twist_mean: Array
     """(3 (L - 1),): prior over the relative twists, radians."""
     twist_covariance: Array
@@ -103,12 +103,12 @@ class BodyModel:
 
     @cached_property
     def part_of_vertex(self) -> NDArray[np.int32]:
-        """(P,): the part with the largest weight."""
+        """(P,): part with the largest weight."""
         return np.argmax(self.vertex_weights, axis=1).astype(np.int32)
 
     @cached_property
     def hand_parts(self) -> NDArray[np.intp]:
-        """Those of both hands."""
+        """Indices of the parts of both hands."""
         return np.flatnonzero([name.rpartition("_")[0] in HAND for name in self.part_names])
 
     @cached_property
@@ -132,18 +132,18 @@ class BodyModel:
 
     @cached_property
     def anchor(self) -> Array:
-        """(P,): weights of the pelvis' centroid, which the translation places."""
+        """(P,): weights whose mean is the pelvis' centroid, which the translation refers to."""
         weights = self.vertex_weights[:, 0] * vertex_areas(self.mean, self.faces)
         return np.asarray(weights / weights.sum())
 
     @cached_property
     def vertex_shares(self) -> Array:
-        """(P,): the area that each vertex stands for, 1 on average."""
+        """(P,): area that each vertex represents, 1 on average."""
         areas = vertex_areas(self.mean, self.faces)
         return np.asarray(areas / areas.mean())
 
     def part_laplacian(self, part: int) -> sp.csr_matrix:
-        """L_p (P, P): the Laplacian with every triangle weighted by its share in the part."""
+        """L_p (P, P): Laplacian with every triangle weighted by its share in a part."""
         solver = self.solver
         share = np.repeat(self.triangle_part_weights[:, part], 3)
         tail = self.faces.ravel()
@@ -157,7 +157,7 @@ class BodyModel:
         return (solver.incidence.multiply(share[None, :]).tocsr() @ gradient).tocsr()
 
     def neutral_state(self) -> BodyState:
-        """The mean body in the neutral pose."""
+        """State of the mean body in the neutral pose."""
         return BodyState(
             np.tile(np.eye(3), (self.part_count, 1, 1)),
             np.zeros(self.beta_count),
@@ -165,7 +165,7 @@ class BodyModel:
         )
 
     def relative_twists(self, rotations: Array) -> Array:
-        """(L, 3): the root's rotation vector, then each part's against its parent, radians."""
+        """Rotation vectors (L, 3): the root's, then each part's relative to its parent, radians."""
         relative = rotations.copy()
         children = self.part_parents >= 0
         relative[children] = (
@@ -174,7 +174,7 @@ class BodyModel:
         return so3_log(relative)
 
     def absolute_rotations(self, twists: Array) -> Array:
-        """(L, 3, 3) of relative twists (L, 3): the inverse of `relative_twists`."""
+        """Absolute rotations (L, 3, 3) of relative twists (L, 3): inverse of `relative_twists`."""
         rotations = so3_exp(twists)
         for part, parent in enumerate(self.part_parents):
             if parent >= 0:
@@ -182,34 +182,33 @@ class BodyModel:
         return rotations
 
     def neutral_surface(self, state: BodyState) -> Array:
-        """X (P, 3): shape and pose-dependent deformation, before the parts turn."""
+        """X (P, 3): neutral surface with the shape and the pose-dependent deformation."""
         twists = self.relative_twists(state.rotations)[1:].ravel().astype(np.float32)
         offset = np.tensordot(state.beta.astype(np.float32), self.directions, 1)
         offset += np.tensordot(twists, self.pose_fields, 1)
         return np.asarray(self.mean + offset)
 
     def vertices(self, state: BodyState) -> Array:
-        """The body, (P, 3) in metres."""
+        """Vertices (P, 3) in metres."""
         return self.turned(self.neutral_surface(state), state.rotations, state.translation)
 
     def turned(self, surface: Array, rotations: Array, translation: Array) -> Array:
-        """A neutral surface (P, 3) with its parts turned and its pelvis put in place."""
+        """Posed surface of a neutral one (P, 3): parts rotated, pelvis at the translation."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         found = self.solver.carried(surface, blended)
         return np.asarray(found - self.anchor @ found + translation)
 
     def unturned(self, vertices: Array, rotations: Array) -> Array:
-        """The neutral surface (P, 3) of a posed one: the inverse of `turned`, its pelvis at the
-        mean body's."""
+        """Neutral surface (P, 3) of a posed one, with the mean body's pelvis."""
         blended = (self.triangle_part_weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         found = self.solver.carried(vertices, _inverse(blended))
         return np.asarray(found + self.anchor @ (self.mean - found))
 
     def repose(self, vertices: Array, state: BodyState, new_state: BodyState) -> Array:
-        """A free-form surface (P, 3) that was fitted at `state`, carried to another pose.
+        """Free-form surface (P, 3) that was fitted at `state`, moved to another pose.
 
-        The body is the model's in the new pose; what the surface has beyond the model turns with
-        the parts that it lies on.
+        The offsets of the surface from the model are rotated with the parts that they lie on and
+        added to the model in the new pose.
         """
         beyond = vertices - self.vertices(state)
         turns = new_state.rotations @ np.swapaxes(state.rotations, 1, 2)
@@ -217,17 +216,17 @@ class BodyModel:
         return self.vertices(new_state) + np.einsum("vij,vj->vi", blended, beyond)
 
     def part_rotations(self, surface: Array, vertices: Array) -> Array:
-        """(L, 3, 3): the rotations that take the parts of a neutral surface to a posed one."""
+        """Rotations (L, 3, 3) of the parts from a neutral surface to a posed one."""
         source, target = edges(surface, self.faces), edges(vertices, self.faces)
         weights = self.triangle_part_weights**2 * self.solver.triangle_weights[:, None]
         products = np.einsum("kei,kej->kij", target, source).reshape(-1, 9)
         return nearest_rotation((weights.T @ products).reshape(-1, 3, 3))
 
     def project(self, vertices: Array, iterations: int = 6, ridge: float = 1e-4) -> BodyState:
-        """The state whose body comes near a mesh (P, 3) in the template's topology.
+        """State whose body is close to a mesh (P, 3) in the template's topology.
 
-        Alternates closed forms: the parts' rotations by Procrustes, the shape by ridge regression
-        of the unposed surface on the components.
+        Alternates closed forms: rotations of the parts by Procrustes, shape by ridge regression of
+        the unposed surface on the components.
         """
         flat = self.directions.reshape(self.beta_count, -1)
         mass = np.repeat(vertex_areas(self.mean, self.faces), 3).astype(np.float32)
@@ -257,7 +256,7 @@ def _inverse(matrices: Array) -> Array:
 
 
 def save_model(path: Path, fields: dict[str, Any], metadata: dict[str, Any]) -> None:
-    """Write a model file: a compressed npz whose `metadata` is JSON text; never a pickle."""
+    """Write a model file: compressed npz without pickles, whose `metadata` is JSON text."""
     document = {"format": FORMAT, "version": 1, **metadata}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, metadata=np.array(json.dumps(document)), **fields)
@@ -268,7 +267,7 @@ def save_model(path: Path, fields: dict[str, Any], metadata: dict[str, Any]) -> 
 
 
 def load_model(path: Path | None = None) -> BodyModel:
-    """The model of a file, or the shipped one.
+    """Load a model file, by default the one that comes with the package.
 
     Raises:
         FormatError: the file is missing, torn, of another version or not a body model.

@@ -1,4 +1,4 @@
-"""Arrays derived from the model, kept in the user's cache folder and rebuilt when torn."""
+"""Cache of arrays that are derived from the model, in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ FOLDER_VARIABLE = "BOOTH_CACHE"
 
 
 def cache_folder() -> Path:
-    """$BOOTH_CACHE, or the user's cache folder on this system."""
+    """$BOOTH_CACHE, or the default cache folder of the system."""
     chosen = os.environ.get(FOLDER_VARIABLE)
     return Path(chosen) if chosen else platformdirs.user_cache_path("body-booth")
 
 
 def cached_arrays(key: str, build: Callable[[], Arrays]) -> Arrays:
-    """The arrays kept under a key, or new ones; a cache that cannot be written is done without.
+    """Arrays stored under a key; they are built if the file is missing or damaged.
 
-    A file appears whole by rename; its checksums tell a torn one (a full disk, a copied folder).
+    A file is renamed when it is complete, and its checksums show damage (a full disk, a copied
+    folder). Without write permission nothing is stored.
     """
     path = cache_folder() / f"{key}.npz"
     try:
@@ -42,5 +43,5 @@ def cached_arrays(key: str, build: Callable[[], Arrays]) -> Arrays:
             np.savez(stream, allow_pickle=False, **arrays)
         temporary.replace(path)
     except OSError:
-        pass  # a folder that takes no files costs time at the next start, not this result
+        pass  # without a cache the next start takes longer; the result is the same
     return arrays

@@ -1,8 +1,9 @@
-"""Deformation gradients on one topology: taking a surface apart into edges and putting it together.
+"""Edges of a triangle mesh, and vertices from transformed edges.
 
-SCAPE (Anguelov et al. 2005) transforms the edges of every triangle and asks for the vertices whose
-edges come nearest in area-weighted least squares. With all three edges of a triangle the normal
-matrix is a weighted graph Laplacian L. It depends on the template alone and is factored once.
+SCAPE (Anguelov et al. 2005) transforms the edges of every triangle and solves for the vertices
+whose edges are nearest to them in area-weighted least squares. With all three edges of a triangle
+the normal matrix is a weighted graph Laplacian L, which depends only on the template and is
+factored once.
 """
 
 from __future__ import annotations
@@ -22,18 +23,22 @@ Graph = tuple[NDArray[np.int32], NDArray[np.int32]]
 """Start of each vertex's neighbours (P + 1,), and all neighbours."""
 
 _PINNED = 0
-"""A Laplacian leaves the translation free: this vertex stays where the input has it."""
+"""Vertex at the origin of solutions, since a Laplacian leaves the translation free."""
 _COLUMNS_AT_ONCE = 16
-"""More right-hand sides at once fall out of the processor's cache."""
+"""Right-hand sides that are solved at once; more do not fit into the processor's cache."""
+_LEAST_AREA = 1e-2
+"""Least weight of a triangle, as a share of the mean: slivers keep their vertices in place."""
+_LEAST_NORMAL_M2 = 1e-12
+"""Guards the division by the length of a vertex normal."""
 
 
 def area_vectors(vertices: Array, faces: Faces) -> Array:
-    """Normals of the triangles, (K, 3), as long as twice their areas.
+    """Normals of the triangles (K, 3), of twice their areas' length.
 
     Raises:
-        IndexError: a triangle names a vertex that is not there.
+        IndexError: a triangle refers to a vertex that does not exist.
     """
-    # Compiled loops look at no bounds.
+    # Compiled loops do not check bounds.
     if int(faces.max(initial=-1)) >= len(vertices):
         raise IndexError(f"triangles name vertex {faces.max()}; there are {len(vertices)}")
     return np.asarray(kernels.area_vectors(vertices, faces))
@@ -51,7 +56,7 @@ def vertex_areas(vertices: Array, faces: Faces) -> Array:
 
 
 def signed_volume(vertices: Array, faces: Faces) -> float:
-    """Volume in cubic metres of a closed surface, positive for faces that turn outwards."""
+    """Volume of a closed surface in cubic metres, positive for faces that point outwards."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return float(np.einsum("ki,ki->", a, np.cross(b, c))) / 6.0
 
@@ -59,11 +64,13 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
     normals = kernels.summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
+    return np.asarray(
+        normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _LEAST_NORMAL_M2)
+    )
 
 
 def neighbours(faces: Faces) -> Graph:
-    """Vertices joined by an edge."""
+    """Graph of the vertices that edges join."""
     tail = np.concatenate([faces.ravel(), np.roll(faces, -1, axis=1).ravel()])
     head = np.concatenate([np.roll(faces, -1, axis=1).ravel(), faces.ravel()])
     graph = sp.csr_matrix((np.ones(len(tail), bool), (tail, head)))
@@ -71,20 +78,20 @@ def neighbours(faces: Faces) -> Graph:
 
 
 def edges(vertices: Array, faces: Faces) -> Array:
-    """The three edges of every triangle, (K, 3, 3): triangle, edge, coordinate."""
+    """Three edges of every triangle (K, 3, 3): triangle, edge, coordinate."""
     corners = vertices[faces]
     return np.asarray(np.roll(corners, -1, axis=1) - corners)
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeSolver:
-    """Vertices from edges for one template: argmin_Y sum_k a_k sum_e |e_k - (y_j - y_i)|^2."""
+    """Least-squares vertices of given edges: argmin_Y sum_k a_k sum_e |e_k - (y_j - y_i)|^2."""
 
     faces: Faces
     triangle_weights: Array
     """a_k: areas of the template's triangles, normalised to mean 1, (K,)."""
     incidence: sp.csr_matrix
-    """(P, 3K): adjoint of the map from vertices to weighted edges."""
+    """(P, 3K): adjoint of the linear map from vertices to weighted edges."""
     laplacian: sp.csr_matrix
     """(P, P)."""
     solver: CholeskySolverD
@@ -93,8 +100,7 @@ class EdgeSolver:
     def build(cls, vertices: Array, faces: Faces) -> EdgeSolver:
         """Factor the normal matrix of a template's triangles."""
         areas = triangle_areas(vertices, faces)
-        # Slivers would vanish from the sum and leave their vertices loose.
-        weights = np.maximum(areas / areas.mean(), 1e-2)
+        weights = np.maximum(areas / areas.mean(), _LEAST_AREA)
         count = len(vertices)
         tail = faces.ravel()
         head = np.roll(faces, -1, axis=1).ravel()
@@ -132,10 +138,15 @@ class EdgeSolver:
         return x
 
     def vertices(self, edges_: Array) -> Array:
-        """Vertices (P, 3) whose edges come nearest to (K, 3, 3), with vertex 0 at the origin."""
+        """Vertices (P, 3) whose edges are nearest to (K, 3, 3), with vertex 0 at the origin."""
         return self.solve(self.incidence @ edges_.reshape(-1, 3))
 
     def carried(self, surface: Array, matrices: Array) -> Array:
-        """Vertices (P, 3) whose edges come nearest to a surface's (P, 3), those of each triangle
-        multiplied by its matrix (K, 3, 3); vertex 0 at the origin."""
-        return self.solve(kernels.edge_pulls(surface, self.faces, matrices, self.triangle_weights))
+        """Vertices (P, 3) whose edges are nearest to a surface's transformed ones; vertex 0 at the
+        origin.
+
+        Args:
+            surface: (P, 3).
+            matrices: (K, 3, 3), which the edges of each triangle are multiplied by.
+        """
+        return self.solve(kernels.edge_sums(surface, self.faces, matrices, self.triangle_weights))

@@ -1,5 +1,7 @@
-"""The inner loops that numpy would pass over memory many times for (numba; each call is one thread,
-so that the same input gives the same bits)."""
+"""Inner loops in numba, where numpy would pass over memory many times.
+
+Each call runs in one thread, so that the same input gives the same bits.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
     positions,
     derivative,
 ):
-    """Add what the blocks of every sample give to its position and derivative.
+    """Add the blocks of every sample to its position and derivative.
 
     Args:
         blocks: (n, 2) first and last + 1 of each sample's blocks; (m,) the part of a block; (m, 3)
@@ -25,7 +27,7 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
             (k,), (k, 3, 3), the same for the relative twist of one joint.
         parents: (L,).
         rotations: (L, 3, 3) float32.
-        beta: (B',) float32, with B' >= the shapes that derivatives are wanted of.
+        beta: (B',) float32, at least as many as there are shape derivatives.
         twists: (L, 3) float32, relative.
         positions: (n, 3) float64, in and out.
         derivative: (n, 3, 3 L + shapes + 3) float32, in and out.
@@ -83,7 +85,7 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @numba.njit(cache=True, fastmath=True, inline="always")
 def _turn(position, derivative, part, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Place a part's vector (x, y, z), turned, and how it changes with the part's turn."""
+    """Add a part's rotated vector (x, y, z) to a position, and its derivative by the rotation."""
     a = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
     b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
     c = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
@@ -101,10 +103,10 @@ def _turn(position, derivative, part, turn, x, y, z):  # type: ignore[no-untyped
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(h,): how badly each of h sets of points lies on a cloud, both ways.
+    """Two-way distances (h,) of h sets of points to a cloud.
 
-    Mean distance of the cloud's points to the nearest of the set, each at most cloud_cut, and
-    tried_share times the mean the other way round, each at most tried_cut.
+    Mean distance of the cloud's points to the nearest one of the set, each at most cloud_cut, plus
+    tried_share times the mean distance of the set's points to the cloud, each at most tried_cut.
 
     Args:
         tried: (h, k, n) float32: k coordinates of n points, k a multiple of 3.
@@ -113,13 +115,13 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
     tries, size, count = tried.shape
     result = np.empty(tries)
     square, back = np.empty((2, count), np.float32)
-    # Squares compare as the whole numbers that their bits are, and those have a vector minimum.
+    # Positive floats compare like the integers of their bits, which have a vectorised minimum.
     square_bits, back_bits = square.view(np.int32), back.view(np.int32)
     for h in range(tries):
         back[:] = np.float32(np.inf)
         total = 0.0
         for p in range(len(cloud)):
-            # Three coordinates at a time: one pass over memory, in vector registers.
+            # Three coordinates at a time: one vectorised pass over memory.
             for k in range(0, size, 3):
                 here0, here1, here2 = cloud[p, k], cloud[p, k + 1], cloud[p, k + 2]
                 row0, row1, row2 = tried[h, k], tried[h, k + 1], tried[h, k + 2]
@@ -141,7 +143,7 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
 
 @numba.njit(cache=True)
 def area_vectors(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(K, 3): normals of triangles (K, 3), as long as twice their areas."""
+    """Normals (K, 3) of triangles, of twice their areas' length."""
     out = np.empty((len(faces), 3))
     for k in range(len(faces)):
         a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
@@ -163,7 +165,7 @@ def area_vectors(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no
 
 @numba.njit(cache=True)
 def summed_at_corners(values, faces, count):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(count, 3): at each vertex, the sum of what the triangles around it have, (K, 3)."""
+    """Sums (count, 3) at the vertices of the values (K, 3) of the triangles around them."""
     out = np.zeros((count, 3))
     for k in range(len(faces)):
         for corner in range(3):
@@ -174,9 +176,11 @@ def summed_at_corners(values, faces, count):  # type: ignore[no-untyped-def]  # 
 
 
 @numba.njit(cache=True)
-def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(P, 3): what the triangles' edges, each turned by its triangle's matrix (K, 3, 3) and
-    weighted (K,), pull at their vertices."""
+def edge_sums(vertices, faces, matrices, weights):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Sums (P, 3) at the vertices of the edges that end there minus those that start there.
+
+    The edges of each triangle are multiplied by its matrix (K, 3, 3) and weight (K,).
+    """
     out = np.zeros(vertices.shape)
     for k in range(len(faces)):
         matrix, weight = matrices[k], weights[k]
@@ -186,25 +190,26 @@ def edge_pulls(vertices, faces, matrices, weights):  # type: ignore[no-untyped-d
             y = vertices[head, 1] - vertices[tail, 1]
             z = vertices[head, 2] - vertices[tail, 2]
             for i in range(3):
-                pull = weight * (matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z)
-                out[head, i] += pull
-                out[tail, i] -= pull
+                edge = weight * (matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z)
+                out[head, i] += edge
+                out[tail, i] -= edge
     return out
 
 
 @numba.njit(cache=True, nogil=True)
 def descend(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """For each point, the node of a graph that no neighbour beats, reached downhill (m,), and
-    whether it is within the limits (m,).
+    """Descend for each point to a node of a graph that is nearer than all its neighbours.
+
+    Returns the nodes (m,) and whether they are within the limits (m,).
 
     Args:
-        points: (m, 6): a place and a direction.
+        points: (m, 6): position and scaled direction.
         nodes: (n, 6).
         first: (n + 1,): where each node's neighbours begin.
         neighbours: (e,).
-        start: (m,): the node that each point sets out from; -1 for points that have none.
-        square: places within the limits have a smaller squared distance ...
-        product: ... and directions a larger product.
+        start: (m,): node that each point starts from; -1 for points that have none.
+        square: largest squared distance of positions within the limits.
+        product: smallest scalar product of directions within the limits.
     """
     out = np.full(len(points), -1, np.int64)
     within = np.zeros(len(points), np.bool_)
@@ -215,9 +220,9 @@ def descend(points, nodes, first, neighbours, start, square, product):  # type: 
         least = 0.0
         for k in range(6):
             least += (points[p, k] - nodes[here, k]) ** 2
-        moved = True
-        while moved:
-            moved = False
+        improved = True
+        while improved:
+            improved = False
             origin = here
             for index in range(first[origin], first[origin + 1]):
                 there = neighbours[index]
@@ -225,7 +230,7 @@ def descend(points, nodes, first, neighbours, start, square, product):  # type: 
                 for k in range(6):
                     distance += (points[p, k] - nodes[there, k]) ** 2
                 if distance < least:
-                    least, here, moved = distance, there, True
+                    least, here, improved = distance, there, True
         apart, along = 0.0, 0.0
         for k in range(3):
             apart += (points[p, k] - nodes[here, k]) ** 2
@@ -265,8 +270,7 @@ def _place(position, turn, x, y, z):  # type: ignore[no-untyped-def]  # pragma: 
 
 @numba.njit(cache=True, nogil=True)
 def transform_groups(points, group, turns, shifts):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """(n, 3): points of groups (n,), each turned by its group's matrix (g, 3, 3), then shifted by
-    its (g, 3)."""
+    """Points (n, 3) rotated by matrices (g, 3, 3) and shifted by vectors (g, 3) of their groups."""
     out = np.empty_like(points)
     for p in range(len(points)):
         turn, shift = turns[group[p]], shifts[group[p]]

@@ -1,9 +1,9 @@
-"""The model at sample vertices: quick values and derivatives.
+"""The model at sample vertices: fast values and derivatives.
 
-Y = sum_p R_p B_p(X) + t, and B_p at a vertex is nearly the same for all vertices of a limb that the
-part p does not belong to: what lies beyond a joint is carried as a whole. So each group of samples
-(one a part) shares a constant for each p, and a sample keeps a block only where it differs from its
-group's by more than hundredths of a millimetre: a third of all, near the part's own borders.
+Y = sum_p R_p B_p(X) + t. B_p is nearly constant over the vertices of another limb, since everything
+beyond a joint moves as a whole. Therefore the samples of a part share a constant for each p, and a
+sample has a block of its own only where it differs from that by more than hundredths of a
+millimetre. That is a third of all, near the borders of the parts.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array32 = NDArray[np.float32]
 Index = NDArray[np.int32]
 
 _SHAPE_FLOOR_M = 4e-5
-"""Blocks whose shape field has a smaller standard deviation over bodies are left out."""
+"""Standard deviation over bodies below which a block is left out."""
 _TWIST_FLOOR_M = 1.5e-4
 """The same for a radian of a relative twist."""
 _SOLVED_AT_ONCE = 192
@@ -35,30 +35,30 @@ _LAYOUT = 1
 
 @dataclass(frozen=True, slots=True)
 class SampledBody:
-    """The model at n vertices; L parts, F = 1 + B + 3 (L - 1) fields (mean, U, C)."""
+    """The model at n vertices, with L parts and F = 1 + B + 3 (L - 1) fields (mean, U, C)."""
 
     model: BodyModel
     indices: NDArray[np.int64]
     groups: Index
-    """(n,): the part that a sample belongs to, whose constant it shares."""
+    """(n,): part of each sample, whose constants it shares."""
     shared: Array32
-    """(L, L, 3, F): group, part; B_p that all samples of a group share."""
+    """(L, L, 3, F): B_p shared by the samples of a part; first index the samples' part, then p."""
     starts: Index
-    """(n, 2): first and last + 1 of a sample's blocks."""
+    """(n, 2): range of each sample's blocks."""
     parts: Index
     mean: Array32
-    """(m, 3): what a sample's B_p has beyond its group's."""
+    """(m, 3): difference of a sample's B_p from the shared one."""
     shape: Array32
     """(m, 3, B)."""
     twist_starts: Index
     twist_parts: Index
     twist_joints: Index
     twist_blocks: Array32
-    """(k, 3, 3): B_p of a unit twist of one joint about each axis, in columns."""
+    """(k, 3, 3): B_p of unit twists of one joint, one axis per column."""
 
     @classmethod
     def build(cls, model: BodyModel, indices: NDArray[np.integer[Any]]) -> SampledBody:
-        """The model at vertices (n,); kept in the user's cache folder."""
+        """Prepare the model at vertices (n,); the arrays are kept in the user's cache folder."""
         chosen = np.asarray(indices, dtype=np.int64)
         made_by = f"{_LAYOUT} {_SHAPE_FLOOR_M} {_TWIST_FLOOR_M} {model.sha256}"
         key = hashlib.sha256(made_by.encode() + chosen.tobytes()).hexdigest()
@@ -66,7 +66,7 @@ class SampledBody:
         return cls(model, chosen, model.part_of_vertex[chosen].astype(np.int32), **arrays)
 
     def first(self, count: int) -> SampledBody:
-        """The first samples alone."""
+        """The first samples only."""
         return SampledBody(
             self.model,
             self.indices[:count],
@@ -122,7 +122,7 @@ class SampledBody:
         return positions, derivative
 
     def _blocks(self) -> tuple[NDArray[Any], ...]:
-        """As the kernels take them."""
+        """Arrays in the order that the kernels take them."""
         return (
             self.starts,
             self.parts,
@@ -135,14 +135,13 @@ class SampledBody:
         )
 
     def _twists(self, state: BodyState) -> Array:
-        """(L, 3): relative; the root's changes nothing of a body's form."""
+        """Relative twists (L, 3), with 0 for the root's, which does not change the body's form."""
         twists = self.model.relative_twists(state.rotations)
         twists[0] = 0.0
         return twists
 
     def arms(self, state: BodyState, joints: Sequence[int]) -> tuple[Array32, Array32]:
-        """B_p(X) (n, L, 3), what each part turns, and its change (n, L, 3, J, 3) with the relative
-        twists of some parts."""
+        """B_p(X) (n, L, 3) and its derivative (n, L, 3, J, 3) by the relative twists of J parts."""
         components = self.model.beta_count
         twists = self.model.relative_twists(state.rotations).astype(np.float32)
         coefficients = np.concatenate([[1.0], state.beta, twists[1:].ravel()]).astype(np.float32)
@@ -165,7 +164,7 @@ class SampledBody:
     def _of_groups(
         self, state: BodyState, twists: Array, shapes: int
     ) -> tuple[Array, NDArray[np.float32]]:
-        """Positions (L, 3) and derivatives (L, 3, D) of the groups' constants."""
+        """Positions (L, 3) and derivatives (L, 3, D) of the shared constants."""
         rotations = state.rotations
         parts = len(rotations)
         coefficients = np.concatenate([[1.0], state.beta, twists[1:].ravel()])
@@ -186,12 +185,12 @@ class SampledBody:
 
 
 def _used(state: BodyState) -> int:
-    """Components up to the last that is not 0."""
+    """Number of components up to the last that is not 0."""
     return 1 + int(np.flatnonzero(state.beta).max(initial=-1))
 
 
 def _expanded(starts: Index) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Samples and blocks, (m,) each, of every block that samples (n, 2) have."""
+    """Sample and block indices (m,) of all blocks in the ranges (n, 2)."""
     counts = starts[:, 1] - starts[:, 0]
     sample = np.repeat(np.arange(len(starts)), counts)
     before = np.cumsum(counts) - counts
@@ -199,7 +198,7 @@ def _expanded(starts: Index) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def twist_chain(model: BodyModel, rotations: Array) -> Array:
-    """First-order change of the relative twists (3 (L - 1), 3 L) with the parts' turns."""
+    """Derivative (3 (L - 1), 3 L) of the relative twists by the parts' rotation increments."""
     parts = model.part_count
     change = np.zeros((3 * (parts - 1), 3 * parts))
     for part, parent in enumerate(model.part_parents):
@@ -212,7 +211,7 @@ def twist_chain(model: BodyModel, rotations: Array) -> Array:
 
 
 def _blocks(model: BodyModel, indices: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Every array of SampledBody that the model's file and the samples determine."""
+    """Arrays of SampledBody that depend only on the model and the samples."""
     parts, components = model.part_count, model.beta_count
     fields = np.concatenate([model.mean[None].astype(np.float32), model.directions])
     columns = np.concatenate([fields, model.pose_fields]).transpose(1, 2, 0)
@@ -263,7 +262,7 @@ def _blocks(model: BodyModel, indices: NDArray[np.int64]) -> dict[str, NDArray[A
 
 
 def _bounds(sample: NDArray[np.intp], count: int, offset: int) -> Index:
-    """First and last + 1 (count, 2) of each sample's entries in a sorted list of samples."""
+    """Range (count, 2) of each sample's entries in a sorted list of samples."""
     border = np.searchsorted(sample, np.arange(count + 1)) + offset
     return np.stack([border[:-1], border[1:]], axis=1).astype(np.int32)
 
@@ -271,13 +270,13 @@ def _bounds(sample: NDArray[np.intp], count: int, offset: int) -> Index:
 def _basis(
     model: BodyModel, indices: NDArray[np.int64], forces: list[tuple[NDArray[np.intp], Array32]]
 ) -> Array32:
-    """B (n, L, 3, F): by the adjoint solve, a column a sample."""
+    """B (n, L, 3, F) by adjoint solutions, one column per sample."""
     basis = np.empty((len(indices), len(forces), 3, forces[0][1].shape[1] // 3), np.float32)
     for start in range(0, len(indices), _SOLVED_AT_ONCE):
         chosen = indices[start : start + _SOLVED_AT_ONCE]
         unit = np.zeros((model.vertex_count, len(chosen)))
         unit[chosen, np.arange(len(chosen))] = 1.0
-        # Anchored: the value at a vertex less that at the pelvis' centroid.
+        # The value at a vertex minus that at the pelvis' centroid.
         unit -= model.anchor[:, None]
         green = model.solver.solve(unit).astype(np.float32).T
         for part, (rows, force) in enumerate(forces):

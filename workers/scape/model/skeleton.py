@@ -19,11 +19,11 @@ from workers.scape.model.deformation import edges, vertex_areas
 Array = NDArray[np.float64]
 
 _OWNED = 0.98
-"""Skin weight from which on a vertex moves with its part alone."""
+"""Skin weight above which a vertex moves only with its part."""
 
 
 def joint_positions(model: BodyModel, vertices: Array, rotations: Array) -> Array:
-    """Joints (L, 3) of a body as it stands, metres; the root's is the pelvis' centroid.
+    """Joints (L, 3) of a posed body, metres; the root's is the pelvis' centroid.
 
     Args:
         vertices: (P, 3) in the template's topology.
@@ -52,14 +52,14 @@ def _template_terms(model: BodyModel) -> tuple[Array, Array]:
     pulls = np.ascontiguousarray((reach * np.repeat(outside, 3, axis=0)).T)
     pulls[0] = 0.0
     fields = model.pose_fields.reshape(model.part_count - 1, 3, model.vertex_count, 3)
-    moved = np.einsum("vp,pmvi->pmi", owners[:, 1:], fields)
+    offsets = np.einsum("vp,pmvi->pmi", owners[:, 1:], fields)
     shifts = np.zeros((model.part_count, 3))
-    shifts[1:] = 0.5 * np.cross(np.eye(3), moved).sum(axis=1)
+    shifts[1:] = 0.5 * np.cross(np.eye(3), offsets).sum(axis=1)
     return pulls, shifts
 
 
 def _descends(parents: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(L, L): row part is column part, or hangs on it."""
+    """Mask (L, L): whether the row's part is the column's part or a descendant of it."""
     found = np.eye(len(parents), dtype=bool)
     for part, parent in enumerate(parents):
         if parent >= 0:

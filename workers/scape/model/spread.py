@@ -1,4 +1,4 @@
-"""Samples that lie far from each other."""
+"""Evenly spread samples of points."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def farthest_first(
     """Indices (count,) of points (n, 3), each the farthest from those before it.
 
     Args:
-        start: the first one.
-        reach: (n,) factors of the distances; small ones make points wait.
+        start: index of the first one.
+        reach: (n,), factors of the distances; points with small ones are taken later.
     """
     reaches = np.broadcast_to(np.asarray(reach, np.float64), len(points))
     return np.asarray(_farthest_first(points, count, start, np.ascontiguousarray(reaches)))
