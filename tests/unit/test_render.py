@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import open3d as o3d
 import pytest
+from PIL import Image
 
 from station.core.geometry import so3_exp
 from workers.export.preview import _spread, preview
@@ -105,6 +107,15 @@ def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]
     assert (again[-30:] != BACKGROUND).any()
     assert np.array_equal(again[:-34], good[:-34])
     assert (again[:, -10:][-30:] == BACKGROUND).all()
+
+
+def test_a_picture_carries_its_order(model: BodyModel) -> None:
+    about = {"label": "Größe 7 \u7c97", "booth": "", "verdict": "ok"}
+    content = preview(model.mean, model.faces, [], OK, about=about)
+    assert np.array_equal(_decoded(content), _decoded(preview(model.mean, model.faces, [], OK)))
+    with Image.open(io.BytesIO(content)) as picture:
+        picture.verify()
+        assert picture.info == {"label": "Größe 7 \u7c97", "verdict": "ok"}
 
 
 def test_a_row_that_is_not_measured_is_left_out(model: BodyModel, rows: list[Measurement]) -> None:

@@ -10,22 +10,29 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _CELL_M = 0.04
+"""Cell size of the height map."""
 _CLOSING = np.ones((5, 5), bool)
-"""Joins the halves of one head, front and back, whose crown nobody saw; not two heads."""
+"""Joins the front and the back of one head, whose crown no camera sees, but not two heads."""
 _LOWEST_LEVEL = 0.55
+"""Lowest level that is searched for separate heads, as a share of the height."""
 _LEVEL_STEP_M = 0.04
 _HEAD_M = 0.12
-"""A head rises so far above what joins it to another."""
+"""Height of a head above the level that joins it to another."""
 _APART_M = 0.30
-_LAYER_M = 0.10
+"""Least distance between two people's heads."""
+_LAYER_M, _LAYER_POINTS = 0.10, 4
+"""Height of the layers below a head, and points that a filled one has."""
 _LEGS_FROM_M = 0.15
+"""Height above the floor at which the layers begin."""
 _FILLED = 0.7
-_LAYER_POINTS = 4
+"""Share of filled layers that a body has; a raised hand has none below it."""
 
 
 def count_people(points: Array) -> int:
-    """People in a connected cloud (n, 3), z up, floor at 0: peaks seen from above that stand apart
-    and have a body below them, which a raised hand has not."""
+    """Number of people in a connected cloud (n, 3), z up, floor at 0.
+
+    People are peaks of the height map that are apart and have a body below them.
+    """
     low = points[:, :2].min(axis=0) - 3 * _CELL_M
     cells = ((points[:, :2] - low) / _CELL_M).astype(np.int64)
     top = np.zeros(cells.max(axis=0) + 4)
@@ -57,7 +64,7 @@ def _is_person(
 
 
 def _apart(centers: list[Array]) -> int:
-    """Number of places (2,) that are not beside one that was counted already."""
+    """Number of centers (2,) that are farther apart than two people's heads."""
     counted: list[Array] = []
     for center in centers:
         if all(np.linalg.norm(center - other) > _APART_M for other in counted):

@@ -23,7 +23,7 @@ _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _SKIN_COLOR = [0.80, 0.68, 0.60, 1.0]
 _LINE_COLOR = [0.72, 0.08, 0.10, 1.0]
 _INFLUENCES = 4
-"""Joints that move a vertex: as many as every glTF reader takes."""
+"""Joints per vertex; every glTF reader takes four."""
 
 
 def mesh_glb(
@@ -60,7 +60,7 @@ def mesh_glb(
 def avatar_glb(
     model: BodyModel, vertices: Array, state: BodyState, about: Mapping[str, Any] | None = None
 ) -> bytes:
-    """The body with a skeleton: it rests as it was scanned.
+    """Body with a skeleton, whose rest pose is the scanned one.
 
     A joint's rotation is that of result.json's pose, so rotations of identity stand the body in the
     model's neutral pose. `about` are extras of the file.
@@ -77,7 +77,7 @@ def avatar_glb(
 
 
 class _File:
-    """A glTF file as it grows: arrays go into one buffer, each with its accessor."""
+    """Builder of a glTF file: arrays go into one buffer, each with its accessor."""
 
     def __init__(self, about: Mapping[str, Any] | None = None) -> None:
         asset = gltf.Asset(version="2.0", generator="body-booth", extras=dict(about or {}))
@@ -123,7 +123,7 @@ class _File:
         return self.mesh("body", primitive)
 
     def positions(self, points: Array) -> int:
-        """Points of the z-up world."""
+        """Accessor of points in the z-up world."""
         found = (points @ _Y_UP_FROM_Z_UP.T).astype(np.float32)
         accessor = self._array(found, gltf.VEC3, gltf.ARRAY_BUFFER)
         self._gltf.accessors[accessor].min = found.min(axis=0).tolist()
@@ -131,7 +131,7 @@ class _File:
         return accessor
 
     def influences(self, weights: Array) -> tuple[int, int]:
-        """Each vertex' strongest joints and their weights, which add up to 1."""
+        """Accessors of each vertex's strongest joints and of their weights, which sum to 1."""
         strongest = np.argsort(-weights, axis=1, kind="stable")[:, :_INFLUENCES]
         kept = np.take_along_axis(weights, strongest, axis=1)
         kept = (kept / kept.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -142,7 +142,7 @@ class _File:
         )
 
     def add_skin(self, model: BodyModel, joints: Array, state: BodyState) -> int:
-        """The skeleton as it rests; returns the root joint's node."""
+        """Add the skeleton in its rest pose; returns the node of the root joint."""
         turn = _Y_UP_FROM_Z_UP
         places = joints @ turn.T
         frames = turn @ state.rotations @ turn.T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
@@ -46,7 +46,7 @@ _SHOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 _BODY_PIXELS = 520
 _BORDER = 26
 _STRIP = 34
-"""Below the bodies: why to scan again."""
+"""Height of the strip below the bodies, for the reasons to scan again."""
 _GAP = 14
 _LINE_GAP = 24
 _SIZE = 15
@@ -68,8 +68,14 @@ def preview(
     measurements: Sequence[Measurement],
     verdict: Verdict,
     heading_rad: float = 0.0,
+    about: Mapping[str, str] | None = None,
 ) -> bytes:
-    """The picture as PNG, of a body that faces so far about z from -y."""
+    """Picture of a body as PNG.
+
+    Args:
+        heading_rad: rotation of the body about z from -y.
+        about: texts that the PNG carries as iTXt chunks.
+    """
     turn = so3_exp(np.array([0.0, 0.0, heading_rad]))
     vertices = vertices @ turn
     by_name = {row.name: replace(row, path=row.path @ turn) for row in measurements}
@@ -85,7 +91,7 @@ def preview(
     if verdict.status != "ok":
         words = _shortened("scan again: " + "; ".join(verdict.reasons), picture.shape[1] - 40)
         write_text(strip, words, (20, 20), size=_SIZE, color=_WARNING)
-    return png(np.concatenate([picture, strip], axis=0))
+    return png(np.concatenate([picture, strip], axis=0), about or {})
 
 
 def _rows(by_name: dict[str, Measurement], names: tuple[str, ...]) -> list[Measurement]:
@@ -98,7 +104,7 @@ def _label(row: Measurement) -> str:
 
 
 def _frame(vertices: Array, view: str) -> Frame:
-    """The whole body in a view, with room for its stature's line."""
+    """Frame of the whole body, with room for the line of its stature."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = float(high[2] - low[2]) / _BODY_PIXELS
     across = float(np.ptp(vertices[:, 0 if view != "side" else 1]))
@@ -150,7 +156,7 @@ def _drawn(
 
 
 def _drawn_stature(picture: Picture, path: Array, frame: Frame, shift: int) -> Array:
-    """The stature stands beside the body, between two ticks."""
+    """Draw the stature beside the body, between two ticks."""
     line = frame.pixels(path) + np.array([shift, 0.0])
     line[:, 0] = shift + 4.0
     draw_line(picture, line, _LINE)
@@ -160,7 +166,7 @@ def _drawn_stature(picture: Picture, path: Array, frame: Frame, shift: int) -> A
 
 
 def _finely(path: Array, step: float) -> Array:
-    """The line with points every `step` metres, so that each can be seen or hidden."""
+    """Line with points every `step` metres, each of which is seen or hidden."""
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     wanted = np.linspace(0.0, along[-1], max(2, int(along[-1] / step)))
@@ -168,7 +174,7 @@ def _finely(path: Array, step: float) -> Array:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Stretches of equal values: first index, index after the last."""
+    """Ranges of equal values: first index, index after the last."""
     changes = np.flatnonzero(np.diff(mask.astype(np.int8))) + 1
     borders = [0, *changes.tolist(), len(mask)]
     return list(pairwise(borders))
@@ -182,7 +188,7 @@ def _write_labels(
     *,
     at_left: bool,
 ) -> None:
-    """Names and values in a column beside the body, each with a thin line to what it names."""
+    """Write names and values in a column beside the body, each with a thin line to its place."""
     if not rows:
         return
     order = np.argsort(ends[:, 1], kind="stable")
@@ -199,7 +205,7 @@ def _write_labels(
 
 
 def _spread(wanted: Array, gap: float, low: float, high: float) -> Array:
-    """Sorted places near the wanted ones, at least a gap apart, inside low and high."""
+    """Sorted positions close to the wanted ones, at least a gap apart, between low and high."""
     placed = wanted.copy()
     for index in range(len(placed)):
         placed[index] = max(placed[index], low if index == 0 else placed[index - 1] + gap)
@@ -211,7 +217,7 @@ def _spread(wanted: Array, gap: float, low: float, high: float) -> Array:
 
 
 def _shortened(text: str, width: int) -> str:
-    """The text, cut where it would leave the picture."""
+    """Text, shortened to a width in pixels."""
     if text_width(text, size=_SIZE) <= width:
         return text
     while text and text_width(text + " …", size=_SIZE) > width:

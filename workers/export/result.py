@@ -57,7 +57,10 @@ def write_result(
             rows = [row for row in measured.rows if not row.parts & missing]
             forward = -fit.state.rotations[0][:, 1]
             heading_rad = float(np.arctan2(forward[0], -forward[1]))
-            picture = beside.submit(preview, fit.vertices, faces, rows, fit.verdict, heading_rad)
+            texts = {**origin.to_json(), "verdict": fit.verdict.status}
+            picture = beside.submit(
+                preview, fit.vertices, faces, rows, fit.verdict, heading_rad, texts
+            )
             files = {
                 "mesh.ply": ply_mesh(fit.vertices, faces, comments),
                 "mesh.obj": obj_mesh(fit.vertices, model, comments),

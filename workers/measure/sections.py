@@ -100,7 +100,7 @@ class EdgeNet:
 
 
 def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]:
-    """Two unit vectors in a plane, the first as near to `along` as can be."""
+    """Two unit vectors in a plane, the first the projection of `along`."""
     if along is None:
         along = np.array((0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0))
     x = along - normal * (along @ normal)
@@ -137,7 +137,7 @@ def _chain(u, v, order):  # type: ignore[no-untyped-def]  # pragma: no cover
                 size -= 1
             kept[size] = here
             size += 1
-        # The last of one chain begins the other.
+        # The last point of one chain is the first of the other.
         size -= 1
     return kept[:size]
 

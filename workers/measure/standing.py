@@ -38,7 +38,7 @@ def standard_turns(model: BodyModel) -> dict[str, Array]:
         whole = _turn(at["elbow"] - at["acromion"], arm)
         girdle = _SHOULDER_GIRDLE_SHARE * whole
         turns[f"shoulder_{side}"] = girdle
-        # What the girdle has turned already, the upper arm need not.
+        # The upper arm takes the rest of the rotation.
         upper = _turn(so3_exp(girdle) @ (at["elbow"] - at["acromion"]), arm)
         turns[f"upper_arm_{side}"] = so3_exp(girdle).T @ upper
         above = so3_exp(upper) @ so3_exp(girdle)
@@ -63,9 +63,9 @@ def stood_upright(model: BodyModel, vertices: Array, state: BodyState) -> Array:
 
 
 def on_both_feet(model: BodyModel, vertices: Array) -> Array:
-    """A body (P, 3) set on the floor by the mean height of its two soles, which is as on the mean
-    body: legs are never quite alike, and who stands on both feet evens that out in the hips.
+    """Body (P, 3) moved vertically so that its two soles have the mean body's mean height.
 
+    Legs differ a little in length; a person who stands on both feet tilts the pelvis instead.
     A sole is the lowest fifth of a foot's vertices.
     """
     lift = np.mean([_sole(model, vertices, part) for part in ("foot_left", "foot_right")])

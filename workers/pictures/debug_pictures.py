@@ -1,4 +1,4 @@
-"""Pictures of a fit's stages, drawn without a display: what --debug writes."""
+"""Pictures of the stages of a fit, as --debug writes them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _BODY_EVENTS = {
 
 
 class DebugPictures:
-    """An observer of a fit that draws each stage from the front, the side and the back.
+    """Observer of a fit that draws each stage from the front, the side and the back.
 
     Files in `folder`, in the order of the fit: 1-cloud.png, 2-start.png,
     3-correspondences-NN.png, 4-joint.png, 5-surface.png (an error map), 6-done.png.
@@ -107,7 +107,7 @@ class DebugPictures:
         (self._folder / f"{name}.png").write_bytes(png(picture))
 
     def _bare(self, frame: Frame) -> Picture:
-        """The points that face the camera, shaded by their normals."""
+        """Draw the points that face the camera, shaded by their normals."""
         picture = np.full((_HEIGHT, _WIDTH, 3), BACKGROUND, np.uint8)
         facing = -(self._normals @ frame.forward)
         shown = np.flatnonzero(facing > 0.0)
@@ -118,7 +118,7 @@ class DebugPictures:
         return picture
 
     def _over(self, scene: Scene, frame: Frame) -> Picture:
-        """The body, and the points that it does not hide."""
+        """Draw the body and the points that it does not hide."""
         shown = scene.render(frame)
         facing = self._normals @ frame.forward < 0.0
         visible = np.flatnonzero(facing & _in_sight(self._points, frame, shown))
@@ -127,7 +127,7 @@ class DebugPictures:
         return shown.picture
 
     def _error_colors(self, residual_m: Array) -> Array:
-        """(K, 3): how far the points lie outside (red) or inside (blue) of each triangle."""
+        """Colours (K, 3) by how far points lie outside (red) or inside (blue) each triangle."""
         known = np.isfinite(residual_m)
         value = np.where(known, residual_m, 0.0)[self._faces]
         count = known[self._faces].sum(axis=1)
@@ -140,7 +140,7 @@ class DebugPictures:
 
 
 def _paired(scene: Scene, on_body: Array, on_cloud: Array, frame: Frame) -> Picture:
-    """The body, and lines from it to the points that pull it: green near, red far."""
+    """Draw the body and lines to the points of its correspondences: green near, red far."""
     shown = scene.render(frame)
     visible = np.flatnonzero(_in_sight(on_body, frame, shown))
     some = visible[:: max(1, len(visible) // _PAIRS_SHOWN)]
@@ -156,7 +156,7 @@ def _paired(scene: Scene, on_body: Array, on_cloud: Array, frame: Frame) -> Pict
 
 
 def _in_sight(points: Array, frame: Frame, shown: Rendering) -> NDArray[np.bool_]:
-    """(n,): points that the body does not hide."""
+    """Mask (n,) of points that the body does not hide."""
     u, v = np.rint(frame.pixels(points)).astype(int).T
     depth = shown.depth_m[np.clip(v, 0, frame.height - 1), np.clip(u, 0, frame.width - 1)]
     return np.asarray(frame.depths(points) < depth + _CLOSE_M)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -27,6 +31,9 @@ TEXT_COLOR: Color = (52, 48, 46)
 _SKIN = (196.0, 208.0, 224.0)
 _LIGHT = np.array([0.35, -0.35, 0.87])
 _AWAY_M = 4.0
+"""Distance of the camera's plane from the middle of the world."""
+_PNG_HEADER = 33
+"""Length of a PNG's signature and its first chunk."""
 _FONT = "sans"
 
 
@@ -63,14 +70,14 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """A picture (h, w, 3) and how far away what it shows is (h, w), infinite at the background."""
+    """Picture (h, w, 3) and its depth (h, w) in metres, infinite at the background."""
 
     picture: Picture
     depth_m: NDArray[np.float32]
 
 
 class Scene:
-    """A mesh, ready to be looked at from several sides."""
+    """Mesh that is drawn from several sides."""
 
     def __init__(self, vertices: Array, faces: NDArray[np.int32]) -> None:
         """Vertices (P, 3), z up, and faces (K, 3), counter-clockwise seen from outside."""
@@ -78,7 +85,7 @@ class Scene:
         self._normals = vertex_normals(vertices, faces)
 
     def render(self, frame: Frame, colors: Array | None = None) -> Rendering:
-        """The mesh as a frame shows it, with smooth edges.
+        """Draw the mesh with smooth edges.
 
         Args:
             colors: (K, 3) of the triangles, blue, green and red up to 255; skin by default.
@@ -105,7 +112,7 @@ def render_mesh(
     center: Array,
     colors: Array | None = None,
 ) -> Picture:
-    """The picture alone, (height, width, 3)."""
+    """Picture (height, width, 3) of a mesh."""
     x, y, z = (float(value) for value in center)
     frame = Frame(view, width, height, meters_per_pixel, (x, y, z))
     return Scene(vertices, faces).render(frame, colors).picture
@@ -114,13 +121,13 @@ def render_mesh(
 def draw_line(
     picture: Picture, line: Array, color: Color, *, thickness: int = 2, closed: bool = False
 ) -> None:
-    """A smooth line through picture points (n, 2)."""
+    """Draw a smooth line through picture points (n, 2)."""
     fixed = np.rint(line * 16.0).astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(picture, [fixed], closed, color, thickness, cv2.LINE_AA, shift=4)
 
 
 def draw_points(picture: Picture, points: Array, colors: NDArray[np.uint8]) -> None:
-    """Points (n, 2) as single pixels in colours (n, 3) or (3,); later ones lie on top."""
+    """Draw points (n, 2) as single pixels in colours (n, 3) or (3,); later ones lie on top."""
     u, v = np.rint(points).astype(int).T
     height, width = picture.shape[:2]
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -136,7 +143,7 @@ def write_text(
     color: Color = TEXT_COLOR,
     bold: bool = False,
 ) -> None:
-    """Text whose first letter stands at a picture point."""
+    """Write text whose first letter is at a picture point."""
     weight = 600 if bold else 400
     cv2.putText(picture, text, at, color, cv2.FontFace(_FONT), size, weight)
 
@@ -148,10 +155,18 @@ def text_width(text: str, *, size: int = 14, bold: bool = False) -> int:
     return int(box[2])
 
 
-def png(picture: Picture) -> bytes:
-    """The picture as a PNG file's content."""
+def png(picture: Picture, about: Mapping[str, str] = MappingProxyType({})) -> bytes:
+    """Content of a PNG file, with texts as iTXt chunks under their names."""
     done, encoded = cv2.imencode(
         ".png", picture, [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     )
     assert done
-    return bytes(encoded.tobytes())
+    content = bytes(encoded.tobytes())
+    chunks = b"".join(_text_chunk(name, text) for name, text in about.items() if text)
+    return content[:_PNG_HEADER] + chunks + content[_PNG_HEADER:]
+
+
+def _text_chunk(name: str, text: str) -> bytes:
+    """iTXt chunk: keyword, not compressed, no language (PNG specification, 11.3.3.4)."""
+    data = b"iTXt" + name.encode("ascii") + bytes(5) + text.encode()
+    return struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))

@@ -1,4 +1,4 @@
-"""A process that warms up, does one job and ends: what it holds or leaks ends with it.
+"""Process that warms up, does one job and ends, so that nothing it holds or leaks outlives the job.
 
 Speaks JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method", "volume"}, reports
 {"step", "share"} and ends with {"status", "reasons"} or {"error"}.
@@ -24,9 +24,9 @@ def _say(channel: int, message: dict[str, Any]) -> None:
 
 def main() -> None:
     die_with_parent()
-    # Ctrl-C on a terminal reaches the whole group; when to end is the pool's to say.
+    # Ctrl-C on a terminal reaches the whole group; the pool decides when this process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Libraries print to stdout; the pipe to the pool must hear this process alone.
+    # Libraries print to stdout; only this process may write to the pipe to the pool.
     channel = os.dup(1)
     os.dup2(2, 1)
     from workers.reconstruct.job import reconstruct_bundle, warm_up

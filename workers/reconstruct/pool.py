@@ -34,7 +34,7 @@ class Outcome:
 
     delivered: bool
     final: bool
-    """No other try would end differently."""
+    """Whether another try would end in the same way."""
     reason: str
 
 
@@ -49,7 +49,7 @@ class JobProcess:
         )
 
     def run(self, bundle: Path, out: Path, config: BoothConfig) -> Outcome:
-        """Give it the job and wait for its end; it is killed when it takes too long."""
+        """Send the job and wait for its end; a job that takes too long is killed."""
         process = self._process
         assert process.stdin is not None
         order = {
@@ -76,7 +76,7 @@ class JobProcess:
         return Outcome(True, True, "")
 
     def _last_message(self, deadline_s: float) -> dict[str, object] | None:
-        """The last line that the process says before it ends; None at the deadline."""
+        """Last message of the process before it ends; None at the deadline."""
         stdout = self._process.stdout
         assert stdout is not None
         last: dict[str, object] = {}
@@ -94,7 +94,7 @@ class JobProcess:
                     last = json.loads(line)
 
     def kill(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
 
