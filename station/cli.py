@@ -25,6 +25,7 @@ COMMANDS = {
     "list": ("station.archive.list_cli:list_scans", "list scans, the newest first"),
     "find": ("station.archive.list_cli:find", "find scans by label"),
     "purge": ("station.booth.retention:purge", "delete a scan and its results"),
+    "retry": ("station.booth.retention:retry", "reconstruct a failed scan again"),
     "capture": ("station.booth.capture:capture", "one camera's capture process"),
     "sync": ("station.booth.sync:sync", "the sync-and-merge process"),
     "control": ("station.booth.control:control", "the operator's endpoint"),

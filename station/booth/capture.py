@@ -11,8 +11,9 @@ import click
 import zmq
 
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.errors import DriverError
-from station.core.service import notify, set_up_logs, stop_event
+from station.core.errors import BoothError, DriverError, FormatError
+from station.core.files import held
+from station.core.service import Heartbeat, set_up_logs, stop_event
 from station.messaging.messages import CameraHealth, DesiredState, FrameHeader, SensorInfo
 from station.messaging.topics import TOPICS
 from station.messaging.transport import publisher, subscriber
@@ -22,6 +23,8 @@ from station.sensors.registry import make_driver
 
 _READ_TIMEOUT_S = 0.1
 _BACK_OFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+_OPENING_S = 60.0
+"""USB may take seconds to open a sensor; a simulated one is rendered first."""
 
 
 class CaptureProcess:
@@ -47,12 +50,15 @@ class CaptureProcess:
         self._told_s = 0.0
         self._frames = self._lost = 0
         self._last_sequence: int | None = None
+        self._unreadable = 0
+        self._heart = Heartbeat(folder, f"capture {name}")
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
-        notify("READY=1")
+        self._heart.ready()
         try:
             while not stop.is_set():
+                self._heart.beat()
                 self._follow_wishes()
                 if not self._streaming:
                     self._close("off")
@@ -68,7 +74,13 @@ class CaptureProcess:
 
     def _follow_wishes(self) -> None:
         while self._wishes.poll(0):
-            self._streaming = DesiredState.unpack(self._wishes.recv_multipart()[1]).streaming
+            try:
+                wish = DesiredState.unpack(self._wishes.recv_multipart()[-1])
+            except FormatError as error:
+                self._unreadable += 1
+                self._log.warning("%s", error)
+                continue
+            self._streaming = wish.streaming
 
     def _open(self, stop: threading.Event) -> None:
         if time.monotonic() < self._open_at_s:
@@ -77,11 +89,14 @@ class CaptureProcess:
         self._state, self._detail = "opening", ""
         self._tell_health(now=True)
         driver = make_driver(self._camera)
+        self._heart.allow(_OPENING_S)
         try:
             self._info = driver.open()
         except DriverError as error:
             self._failed(driver, error)
             return
+        finally:
+            self._heart.allow(None)
         self._driver = driver
         if self._clock is not None:
             # A sensor that comes back may count from anywhere.
@@ -121,8 +136,8 @@ class CaptureProcess:
             depth_scale_m=info.depth_scale_m,
             device_ticks=frame.device_ticks,
             tick_hz=info.tick_hz,
-            host_time_s=clock.host_time_s(frame.device_ticks, frame.host_time_s),
-            received_s=frame.host_time_s,
+            host_time_s=clock.host_time_s(frame.device_ticks, frame.received_s),
+            received_s=frame.received_s,
             sequence=self._frames + self._lost,
             clock_resets=self._clock_resets(),
         )
@@ -158,7 +173,18 @@ class CaptureProcess:
         self._out.send_multipart([self._health_topic, health.pack()])
         if self._info is not None:
             self._out.send_multipart([self._sensor_topic, self._sensor(self._info).pack()])
-        notify("WATCHDOG=1")
+        self._heart.tell(
+            {
+                "state": self._state,
+                "detail": self._detail,
+                "frames": self._frames,
+                "lost": self._lost,
+                "clock_resets": self._clock_resets(),
+                "clock_offset_s": clock.offset_s if (clock := self._clock) else None,
+                "clock_drift": clock.drift if clock else None,
+                "unreadable_messages": self._unreadable,
+            }
+        )
 
     def _sensor(self, info: DeviceInfo) -> SensorInfo:
         return SensorInfo(
@@ -188,4 +214,6 @@ def capture(camera: str, config_path: Path | None) -> None:
     config = load_config(find_config(config_path))
     config.camera(camera)
     log = set_up_logs(f"capture {camera}")
-    CaptureProcess(config, camera, log).run(stop_event())
+    lock = config.runtime.folder / f"capture-{camera}.lock"
+    with held(lock, BoothError(f"camera {camera} is captured already here ({lock})")):
+        CaptureProcess(config, camera, log).run(stop_event())

@@ -1,5 +1,18 @@
-"""The operator's endpoint: start, stop, scan, status. Every command is answered, and twice the same
-does no harm."""
+"""The operator's endpoint: start, stop, scan, cancel, status. Every command is answered, and twice
+the same does no harm.
+
+Commands are `Request` messages to the socket `control` in the runtime folder, answers `Reply`
+messages (`station.messaging`). Their content:
+
+    start, stop          {"streaming": bool}
+    scan, scan-status,   {"scan_id", "label", "state", "framesets", "wanted", "reason", "path"};
+    cancel               `station.booth.session` names the states. A scan is ordered at once; its
+                         state, also a refusal, is asked for with scan-status
+    status               `station.booth.health.BoothHealth`
+
+Control remembers nothing of scans: orders are notes in the spool, sync gives the verdict, and
+both outlive this process. Scans by label and time: `station.archive`.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +20,7 @@ import json
 import logging
 import threading
 import time
+from collections import OrderedDict
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,27 +28,29 @@ from typing import Any
 import click
 import zmq
 
+from station.booth.health import booth_health
+from station.booth.metrics import serve_metrics
 from station.booth.retention import expire_old
-from station.booth.session import CANCELLED, ON_DISK, Session, advance, expire
+from station.booth.session import CANCELLED, UNSURE, Session, overdue, state_of
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.files import private_folder, write_json
-from station.core.service import notify, set_up_logs, stop_event
-from station.core.spool import REASON, Spool, count_scans
+from station.core.files import held, private_folder, write_json
+from station.core.scans import ScanId, ScanNote, boot_id, scan_id_of
+from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.spool import Spool, failure_reason
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
-from station.messaging.transport import ask, publisher, server, subscriber
+from station.messaging.transport import ask, dealer, publisher, server, subscriber
 
 _POLL_MS = 50
 _SYNC_TIMEOUT_S = 2.0
-_GRACE_S = 4.0
-"""Beyond a scan's longest duration: writing the bundle and the news of it."""
-_SESSIONS_KEPT = 200
-_TIDY_PERIOD_S = 3600.0
+_TIDY_PERIOD_S = 600.0
+_REMIND_PERIOD_S = 0.5
+_PROGRESS_KEPT = 100
 
 
 class ControlProcess:
-    """Holds what the operator wants, and what became of each scan."""
+    """Holds what the operator wants, and tells what became of each scan."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
@@ -43,25 +59,29 @@ class ControlProcess:
         self._requests = server(self._context, self._folder, "control")
         self._wishes = publisher(self._context, self._folder, "desired", "desired")
         self._events = subscriber(self._context, self._folder, ["events"], ["scan"])
+        self._orders = dealer(self._context, self._folder, "sync")
         self._spool = Spool(config.spool.folder)
-        self._sessions: dict[str, Session] = {}
+        self._progress: OrderedDict[str, ScanEvent] = OrderedDict()
+        self._reminded_s: dict[str, float] = {}
         self._memory = private_folder(self._folder) / "desired.json"
         self._streaming = self._remembered()
         self._wished_s = 0.0
         self._tidied_s = -_TIDY_PERIOD_S
+        self._unreadable = 0
+        self._heart = Heartbeat(self._folder, "control")
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
         poller = zmq.Poller()
-        poller.register(self._requests, zmq.POLLIN)
-        poller.register(self._events, zmq.POLLIN)
-        self._spool.sweep()
-        notify("READY=1")
+        for socket in (self._requests, self._events, self._orders):
+            poller.register(socket, zmq.POLLIN)
+        self._heart.ready()
         while not stop.is_set():
             ready = dict(poller.poll(_POLL_MS))
             if self._events in ready:
-                event = ScanEvent.unpack(self._events.recv_multipart()[1])
-                self._hear(event)
+                self._hear()
+            if self._orders in ready:
+                self._orders.recv_multipart()  # sync's word on an order is on disk
             if self._requests in ready:
                 self._answer()
             now_s = time.monotonic()
@@ -69,41 +89,64 @@ class ControlProcess:
                 self._wish()
             if now_s - self._tidied_s > _TIDY_PERIOD_S:
                 self._tidied_s = now_s
-                for folder in expire_old(self._spool, self._config.retention, time.time()):
-                    self._log.info("removed %s: its retention period is over", folder)
+                self._tidy()
+            self._heart.beat()
+            if self._heart.due:
+                self._heart.tell(
+                    {"streaming": self._streaming, "unreadable_messages": self._unreadable}
+                )
         self._context.destroy(linger=0)
 
     def _remembered(self) -> bool:
         """The operator's last order: a restarted control must not stop the sensors."""
         try:
             return bool(json.loads(self._memory.read_text())["streaming"])
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError):
             return False
 
     def _wish(self) -> None:
         self._wished_s = time.monotonic()
         self._wishes.send_multipart([b"desired", DesiredState(self._streaming).pack()])
-        notify("WATCHDOG=1")
 
-    def _hear(self, event: ScanEvent) -> None:
-        session = self._sessions.get(event.scan_id)
-        if session is None or event.state not in ("capturing", "accepted", "failed"):
+    def _tidy(self) -> None:
+        try:
+            self._spool.sweep()
+            for folder in expire_old(self._spool, self._config.retention):
+                self._log.info("removed %s: its retention period is over", folder)
+        except OSError as error:
+            self._log.warning("old scans are not removed: %s", error)
+
+    def _hear(self) -> None:
+        parts = self._events.recv_multipart()
+        try:
+            event = ScanEvent.unpack(parts[-1])
+        except BoothError:
+            self._unreadable += 1
             return
-        self._sessions[event.scan_id] = advance(
-            session,
-            event.state,  # type: ignore[arg-type]  # narrowed by the line above
-            framesets=event.framesets,
-            wanted=event.wanted,
-            reason=event.reason,
-        )
+        if not event.wanted:
+            return  # a verdict: it is on disk
+        self._progress[event.scan_id] = event
+        self._progress.move_to_end(event.scan_id)
+        while len(self._progress) > _PROGRESS_KEPT:
+            self._progress.popitem(last=False)
 
     def _answer(self) -> None:
         *route, packed = self._requests.recv_multipart()
         try:
             reply = self._reply(Request.unpack(packed))
-        except (BoothError, OSError) as error:
+        except BoothError as error:
             reply = Reply(ok=False, error=str(error))
-        self._requests.send_multipart([*route, reply.pack()])
+        except OSError as error:
+            reply = Reply(
+                ok=False,
+                error=f"the disk refuses ({error.strerror or error}: {error.filename or 'spool'}); "
+                "free or mend it, see station status",
+            )
+        try:
+            self._requests.send_multipart([*route, reply.pack()])
+        except zmq.ZMQError as error:
+            # Who asked is gone, or gave no address to answer to.
+            self._log.info("an answer could not be sent (%s)", error)
 
     def _reply(self, request: Request) -> Reply:
         if request.command in ("start", "stop"):
@@ -116,37 +159,55 @@ class ControlProcess:
         if request.command == "cancel":
             return self._cancel(request)
         if request.command == "scan-status":
-            return Reply(ok=True, content=self._scan_status(request.scan_id))
+            return Reply(ok=True, content=self._scan_status(scan_id_of(request.scan_id)))
         if request.command == "status":
-            return Reply(ok=True, content=self._status())
-        return Reply(ok=False, error=f"control knows no command {request.command!r}")
+            health = booth_health(self._config)
+            return Reply(ok=True, content={**asdict(health), "streaming": self._streaming})
+        return Reply(ok=False, error=f"control knows no command {request.command!a:.80}")
 
     def _scan(self, request: Request) -> Reply:
-        if request.scan_id in self._sessions or self._spool.where(request.scan_id):
-            return Reply(ok=True, content=self._scan_status(request.scan_id))
+        """Note an order and pass it on; only sync says what becomes of it."""
+        scan_id = scan_id_of(request.scan_id)
+        if self._session(scan_id) is not None:
+            return Reply(ok=True, content=self._scan_status(scan_id))
         if not self._streaming:
             return Reply(ok=False, error="the sensors are stopped; run station start first")
-        answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
-        if not answer.ok:
-            return answer
-        self._sessions[request.scan_id] = Session(request.scan_id, request.label, time.monotonic())
-        for old in list(self._sessions)[:-_SESSIONS_KEPT]:
-            del self._sessions[old]
-        return Reply(ok=True, content=self._scan_status(request.scan_id))
+        now_s = time.monotonic()
+        valid_until_s = request.valid_until_s or now_s + self._config.runtime.command_timeout_s
+        if now_s > valid_until_s:
+            return Reply(
+                ok=False, error=f"the order of scan {scan_id} came too late; nothing was begun"
+            )
+        note = ScanNote(
+            scan_id, "armed", label=request.label, valid_until_s=valid_until_s, boot=boot_id()
+        )
+        self._spool.notes.write(note, durable=False)
+        self._pass_on(note)
+        return Reply(ok=True, content=self._scan_status(scan_id))
+
+    def _pass_on(self, note: ScanNote) -> None:
+        """Send an order to sync, without waiting: sync may be starting again just now."""
+        self._reminded_s = {note.scan_id: time.monotonic()}
+        valid_until_s = note.valid_until_s if note.boot == boot_id() else -1.0
+        request = Request("scan", note.scan_id, note.label, valid_until_s)
+        try:
+            self._orders.send_multipart([b"", request.pack()], zmq.NOBLOCK)
+        except zmq.Again:
+            self._log.warning("sync takes no orders just now")
 
     def _cancel(self, request: Request) -> Reply:
         """Give a scan up while it is taken or waits; later there is a result, to be purged."""
-        scan_id = request.scan_id
-        place = self._spool.where(scan_id)
+        scan_id = scan_id_of(request.scan_id)
         status = self._scan_status(scan_id)
         if status["state"] == "failed":
             return Reply(ok=True, content=status)
-        if place is None:
+        if status["state"] in ("armed", "capturing"):
             answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
             if not answer.ok:
                 return answer
-            self._sessions[scan_id] = advance(self._sessions[scan_id], "failed", reason=CANCELLED)
-        elif place != "queue" or not self._spool.withdraw(scan_id, CANCELLED):
+            # Sync's verdict is on its way to the disk.
+            return Reply(ok=True, content={**status, "reason": CANCELLED})
+        if status["state"] != "accepted" or not self._spool.withdraw(scan_id, CANCELLED):
             return Reply(
                 ok=False,
                 error=f"scan {scan_id} is past cancelling (it is {status['state']}); "
@@ -154,60 +215,43 @@ class ControlProcess:
             )
         return Reply(ok=True, content=self._scan_status(scan_id))
 
-    def _scan_status(self, scan_id: str) -> dict[str, Any]:
-        """A scan's state; of accepted ones the disk is the truth.
+    def _scan_status(self, scan_id: ScanId) -> dict[str, Any]:
+        """A scan's state as the disk has it.
 
         Raises:
             BoothError: nobody knows the scan.
         """
-        place = self._spool.where(scan_id)
-        session = self._sessions.get(scan_id)
+        session = self._session(scan_id)
         if session is None:
-            if place is None:
-                raise BoothError(f"scan {scan_id} is unknown here; see station status")
-            session = Session(scan_id, "", time.monotonic(), "accepted")
-        session = self._with_disk(session, place)
-        if place is None and session.state not in ON_DISK:
-            limit_s = self._config.scan.max_duration_s + _GRACE_S
-            session = expire(session, time.monotonic(), limit_s)
-        self._sessions[scan_id] = session
-        return {**asdict(session), "path": str(self._spool.path(place, scan_id)) if place else ""}
+            raise BoothError(f"scan {scan_id} is unknown here; see station list")
+        return asdict(session)
 
-    def _with_disk(self, session: Session, place: str | None) -> Session:
-        if place == "queue":
-            return advance(session, "accepted")
-        if place == "work":
-            return advance(session, "reconstructing")
+    def _session(self, scan_id: ScanId) -> Session | None:
+        note = self._spool.notes.read(scan_id)
+        place = self._spool.where(scan_id)
+        if place is None:
+            # It may have got its verdict between the two looks.
+            note = self._spool.notes.read(scan_id)
+        state = state_of(note, place)
+        if state is None:
+            return None
+        reason = "" if note is None or state in ("accepted", "reconstructing") else note.reason
         if place == "failed":
-            return advance(session, "failed", reason=self._reason(session.scan_id))
-        if place == "outbox":
-            result = json.loads(
-                (self._spool.path(place, session.scan_id) / "result.json").read_text()
-            )
-            if result["status"] == "ok":
-                return advance(session, "delivered")
-            return advance(session, "rescan", reason="; ".join(result["reasons"]))
-        return session
-
-    def _reason(self, scan_id: str) -> str:
-        try:
-            return str(
-                json.loads((self._spool.path("failed", scan_id) / REASON).read_text())["reason"]
-            )
-        except (OSError, ValueError, KeyError):
-            return "unknown; see the workers' log"
-
-    def _status(self) -> dict[str, Any]:
-        try:
-            sync = ask(self._folder, "sync", Request("status"), _SYNC_TIMEOUT_S)
-            sensed: dict[str, Any] = sync.content
-        except BoothError as error:
-            sensed = {"error": str(error)}
-        return {
-            "streaming": self._streaming,
-            "spool": count_scans(self._spool.folder),
-            "sync": sensed,
-        }
+            reason = failure_reason(self._spool.path(place, scan_id))
+        if note is not None and place is None and overdue(note, time.monotonic(), boot_id()):
+            reason = UNSURE
+            if time.monotonic() - self._reminded_s.get(scan_id, 0.0) > _REMIND_PERIOD_S:
+                self._pass_on(note)
+        progress = self._progress.get(scan_id)
+        return Session(
+            scan_id,
+            "" if note is None else note.label,
+            state,
+            framesets=progress.framesets if progress else 0,
+            wanted=progress.wanted if progress else 0,
+            reason=reason,
+            path=str(self._spool.path(place, scan_id)) if place else "",
+        )
 
 
 @click.command()
@@ -220,4 +264,8 @@ def control(config_path: Path | None) -> None:
       station control --config booth.toml
     """
     config = load_config(find_config(config_path))
-    ControlProcess(config, set_up_logs("control")).run(stop_event())
+    lock = config.runtime.folder / "control.lock"
+    with held(lock, BoothError(f"a control process runs already here ({lock}); end it first")):
+        log = set_up_logs("control")
+        serve_metrics(config, log)
+        ControlProcess(config, log).run(stop_event())

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from station.booth.frameset import Frameset
+from station.core.errors import BoothError
 from station.core.lens import rays
 from station.core.rig import Rig
+from station.messaging.intake import LiveFrame
 
 _STRIDE_PX = 6
+_LOOK_PERIOD_S = 2.0
+"""How often a missing calibration is looked for."""
 
 
 def merged_points(
@@ -21,9 +28,38 @@ def merged_points(
     for name, depth in depths.items():
         camera = rig.cameras[name]
         z = depth[::_STRIDE_PX, ::_STRIDE_PX] * np.float32(scale_m)
-        v, u = np.nonzero(z)
-        distance = z[v, u]
-        points = rays(camera)[v * _STRIDE_PX, u * _STRIDE_PX] * distance[:, None]
+        seen = z > 0
+        points = rays(camera)[::_STRIDE_PX, ::_STRIDE_PX][seen] * z[seen, None]
         pose = camera.world_from_camera
         clouds.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
     return np.concatenate(clouds) if clouds else np.empty((0, 3), np.float32)
+
+
+class LiveCloud:
+    """A frameset now and then as a cloud, once there is a calibration."""
+
+    def __init__(self, calibration: Path, rate_hz: float) -> None:
+        self._calibration, self._period_s = calibration, 1.0 / rate_hz
+        self._last_s = self._looked_s = -1e9
+        self.rig: Rig | None = None
+
+    def points(self, found: Frameset[LiveFrame], now_s: float) -> NDArray[np.float32] | None:
+        """The cloud (n, 3) of a frameset, or None if it is not time for one."""
+        if now_s - self._last_s < self._period_s:
+            return None
+        self._last_s = now_s
+        if self.rig is None and now_s - self._looked_s > _LOOK_PERIOD_S:
+            self._looked_s = now_s
+            with suppress(BoothError, OSError):
+                self.rig = Rig.load(self._calibration)
+        rig = self.rig
+        if rig is None:
+            return None
+        frames = {name: frame for name, frame in found.frames.items() if name in rig.cameras}
+        fitting = {
+            name: frame.depth
+            for name, frame in frames.items()
+            if frame.depth.shape == (rig.cameras[name].height, rig.cameras[name].width)
+        }
+        scale_m = next(iter(found.frames.values())).header.depth_scale_m
+        return merged_points(rig, fitting, scale_m)

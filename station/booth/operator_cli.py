@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import json
-import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from datetime import UTC, datetime
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
-from station.booth.session import FINAL, ON_DISK
+from station.booth.health import MOST_AGE_S, booth_health
+from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.spool import count_scans
+from station.core.files import is_held
+from station.core.scans import new_scan_id, scan_id_of
 from station.messaging.messages import Request
-from station.messaging.transport import ask
+from station.messaging.transport import STATION_LOCK, NoAnswerError, ask
 
 _POLL_S = 0.05
 _EXIT_RESCAN = 3
+_UNSURE_S = 15.0
+"""A process that hangs is replaced within this time, and then says what became of a scan."""
+_MOST_LETTERS = 200
+_LOCKS = (STATION_LOCK, "control.lock", "sync.lock")
 _WORDS = {
     "armed": "waiting for the cameras",
     "capturing": "hold still",
@@ -110,7 +114,9 @@ def cancel(scan_id: str, config_path: Path | None) -> None:
 @config_option
 @click.option("--json", "as_json", is_flag=True, help="for programs")
 def status(config_path: Path | None, as_json: bool) -> None:
-    """Show cameras, framesets and the spool.
+    """Show processes, cameras, framesets and the spool, and what is wrong with them.
+
+    Exit code 1: the station does not answer; what is known of it is shown all the same.
 
     \b
     Examples:
@@ -118,35 +124,48 @@ def status(config_path: Path | None, as_json: bool) -> None:
       station status --json
     """
     config = load_config(find_config(config_path))
+    error = None
     try:
         content = _command(config, Request("status"))
-    except BoothError:
-        # What was accepted and delivered is on disk, whether a station runs or not.
-        if config.spool.folder.is_dir() and not as_json:
-            with suppress(OSError):
-                _show_spool(count_scans(config.spool.folder))
-        raise
+    except BoothError as problem:
+        error, content = problem, {**asdict(booth_health(config)), "streaming": None}
     if as_json:
         click.echo(json.dumps(content))
-        return
-    click.echo("sensors " + ("started" if content["streaming"] else "stopped"))
-    for name, camera in content["sync"].get("cameras", {}).items():
-        # Sensors that were stopped are not amiss.
-        amiss = camera["silent"] and content["streaming"]
-        words = "silent" if amiss else camera["state"]
+    else:
+        _show_status(content)
+    if error is not None:
+        raise error
+
+
+def _show_status(content: Mapping[str, Any]) -> None:
+    streaming = content["streaming"]
+    if streaming is not None:
+        click.echo("sensors " + ("started" if streaming else "stopped"))
+    if any(content["processes"].values()):
+        click.echo(f"  {'process':<22} {'state':<10} last word")
+        for name, told in content["processes"].items():
+            alive = bool(told) and told["age_s"] <= MOST_AGE_S
+            age = f"{told['age_s']:.0f} s ago" if told else "never"
+            click.echo(f"  {name:<22} {'runs' if alive else 'SILENT':<10} {age}")
+    cameras = content["sync"].get("cameras", {})
+    if cameras:
+        click.echo(f"  {'camera':<22} {'state':<10} {'frames':>8} {'lost':>6} {'Hz':>5}")
+    for name, camera in cameras.items():
+        # Sensors that were stopped are expected to be silent.
+        unexpectedly_silent = camera["silent"] and streaming
+        words = "silent" if unexpectedly_silent else camera["state"]
+        rate = f"{camera['rate_hz']:.0f}" if camera["rate_hz"] else ""
         click.echo(
-            f"  {name:<16} {words:<10} {camera['frames']} frames, {camera['lost']} lost"
+            f"  {name:<22} {words:<10} {camera['frames']:>8} {camera['lost']:>6} {rate:>5}"
             + (f"  {camera['detail']}" if camera["detail"] else "")
         )
-    if "error" in content["sync"]:
-        click.echo(f"  {content['sync']['error']}")
-    _show_spool(content["spool"])
-
-
-def _show_spool(counts: Mapping[str, int]) -> None:
+    counts = content["spool"]
+    free = f"; {content['free_bytes'] / 1e9:.1f} GB free" if content["free_bytes"] else ""
     click.echo(
-        f"spool: {', '.join(f'{count} {state}' for state, count in counts.items()) or 'empty'}"
+        f"spool: {', '.join(f'{n} {state}' for state, n in counts.items()) or 'empty'}{free}"
     )
+    for problem in content["problems"]:
+        click.echo(f"! {problem}")
 
 
 @click.command()
@@ -168,10 +187,11 @@ def scan(
       station scan --no-wait
     """
     config = load_config(find_config(config_path))
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    scan_id = scan_id or f"{stamp}-{secrets.token_hex(2)}"
+    scan_id = scan_id_of(scan_id) if scan_id else new_scan_id()
     began_s = time.monotonic()
-    session = _command(config, Request("scan", scan_id, label))
+    valid_until_s = began_s + config.runtime.command_timeout_s
+    order = Request("scan", scan_id, _text(label), valid_until_s)
+    session = _patiently(config, order)
     click.echo(f"scan {scan_id}")
     try:
         session = _follow(config, scan_id, session, _enough(wait), began_s + timeout_s)
@@ -185,7 +205,7 @@ def scan(
     if not wait:
         return
     click.echo(session["path"])
-    _show_result(Path(session["path"]))
+    _show_result(session["path"])
     click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result")
     if session["state"] == "rescan":
         click.echo(f"scan again: {session['reason']}", err=True)
@@ -206,9 +226,13 @@ def _follow(
     deadline_s: float,
 ) -> dict[str, Any]:
     """Show each new state on a line of its own until it is enough."""
-    told, free = "", False
+    told, free, sure_s = "", False, time.monotonic()
     while True:
         state = session["state"]
+        if session["reason"] != UNSURE:
+            sure_s = time.monotonic()
+        elif time.monotonic() - sure_s > _UNSURE_S:
+            raise UnsureError(scan_id)
         if state in ON_DISK and state != "accepted" and not free:
             # The scan was quicker than the question: the person waits for this word.
             click.echo(f"  {_WORDS['accepted']:<44}")
@@ -216,6 +240,8 @@ def _follow(
         words = _WORDS.get(state, state)
         if state == "capturing" and session["wanted"]:
             words += f" ({session['framesets']} of {session['wanted']})"
+        if session["reason"] == UNSURE:
+            words = UNSURE
         if words != told:
             fresh = sys.stdout.isatty() and told.startswith("hold still")
             click.echo(("\r" if fresh else "") + f"  {words:<44}", nl=not words.startswith("hold"))
@@ -227,10 +253,50 @@ def _follow(
         if time.monotonic() > deadline_s:
             raise BoothError(f"scan {scan_id} is {state} and not done in time; see station status")
         time.sleep(_POLL_S)
-        session = _command(config, Request("scan-status", scan_id))
+        session = _patiently(config, Request("scan-status", scan_id))
 
 
-def _show_result(folder: Path) -> None:
+class UnsureError(BoothError):
+    """Nobody could say in time what became of a scan."""
+
+    def __init__(self, scan_id: str) -> None:
+        super().__init__(f"scan {scan_id}: {UNSURE} before station status, or list {scan_id}, says")
+
+
+def _patiently(config: BoothConfig, request: Request) -> dict[str, Any]:
+    """Control's answer on a scan, asked for until it comes: the same order twice is one scan.
+
+    Raises:
+        UnsureError: it did not come; the scan may be taken all the same.
+        BoothError: control refused; nothing was begun.
+    """
+    deadline_s = time.monotonic() + _UNSURE_S
+    told = False
+    while True:
+        try:
+            return _command(config, request)
+        except NoAnswerError:
+            if not told and not any(is_held(config.runtime.folder / lock) for lock in _LOCKS):
+                # No station runs here: the order reached nobody.
+                raise
+            if time.monotonic() > deadline_s:
+                raise UnsureError(request.scan_id) from None
+            if not told:
+                click.echo(f"  {UNSURE}", err=True)
+            told = True
+
+
+def _text(label: str) -> str:
+    """A label of letters that can be written and printed."""
+    text = label.encode(errors="surrogateescape").decode(errors="replace")
+    return "".join(letter if letter.isprintable() else " " for letter in text)[:_MOST_LETTERS]
+
+
+def _show_result(path: str) -> None:
+    folder = Path(path)
+    if not path or not folder.is_dir():
+        click.echo("  delivered; the result has been taken from the outbox")
+        return
     document = json.loads((folder / "measurements.json").read_text())
     click.echo("")
     for row in document["measurements"]:

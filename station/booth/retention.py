@@ -1,54 +1,191 @@
-"""Retention of body scans, and the deletion of one."""
+"""How long body scans are kept, and how one is deleted.
+
+A wall clock may jump: a dead battery, a mistyped date. So time is counted in a file of the spool
+(`retention.json`): within a boot by the kernel's clock since the boot, from one boot to the next by
+the wall clock, but no more than four days at once. A longer shutdown, or a clock that jumps ahead,
+deletes later, never earlier.
+"""
 
 from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import click
 
 from station.archive.index import ScanIndex
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
-from station.core.spool import Spool
+from station.core.files import held, read_small, write_json
+from station.core.scans import ScanId, boot_id, scan_id_of
+from station.core.spool import STATES, Spool
 
+FILE = "retention.json"
+LONGEST_OFF_S = 4 * 86_400.0
+"""A long weekend."""
 _DAY_S = 86_400.0
 _MOST_OF_A_LABEL = 10_000
+_MOST_BYTES = 16 << 20
+_BUSY = SpoolError("old scans are being removed just now; do it again")
+_ORDER_S = 60.0
+"""So long after its order a scan without a bundle is not being taken any more."""
 
 
-def expire_old(spool: Spool, retention: RetentionConfig, now_s: float) -> list[Path]:
-    """Remove bundles of delivered scans, results and failed scans that are past their time."""
-    limits = {
-        "done": retention.raw_days,
-        "outbox": retention.result_days,
-        "failed": retention.result_days,
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Three clocks at once."""
+
+    wall_s: float
+    since_boot_s: float
+    boot: str
+
+    @classmethod
+    def now(cls) -> Moment:
+        return cls(time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), boot_id())
+
+
+@dataclass(frozen=True, slots=True)
+class Ages:
+    """Counted time, and when each folder of a scan was first seen in it."""
+
+    counted_s: float = 0.0
+    last: Moment | None = None
+    seen_s: dict[str, float] = field(default_factory=dict)
+    """"<state>/<scan id>" -> counted time."""
+
+
+def advance(ages: Ages, now: Moment) -> Ages:
+    """The counted time at a moment (pure)."""
+    last = ages.last
+    if last is None:
+        passed_s = 0.0
+    elif last.boot == now.boot:
+        passed_s = max(0.0, now.since_boot_s - last.since_boot_s)
+    else:
+        off_s = now.wall_s - last.wall_s - now.since_boot_s
+        passed_s = now.since_boot_s + min(max(off_s, 0.0), LONGEST_OFF_S)
+    return replace(ages, counted_s=ages.counted_s + passed_s, last=now)
+
+
+def due(ages: Ages, folders: list[str], limits_s: dict[str, float]) -> tuple[Ages, list[str]]:
+    """Which folders ("<state>/<scan id>") are past their time (pure).
+
+    A folder that is seen for the first time begins to age.
+    """
+    seen = {name: ages.seen_s.get(name, ages.counted_s) for name in folders}
+    old = [
+        name
+        for name, first_s in seen.items()
+        if ages.counted_s - first_s > limits_s.get(name.split("/")[0], float("inf"))
+    ]
+    return replace(ages, seen_s=seen), old
+
+
+def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = None) -> list[Path]:
+    """Remove bundles of delivered scans, results, failed scans and notes that are past their time.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    result_s = retention.result_days * _DAY_S
+    limits_s = {
+        "done": retention.raw_days * _DAY_S,
+        "outbox": result_s,
+        "failed": result_s,
+        "scans": max(result_s, retention.raw_days * _DAY_S),
     }
-    removed = []
-    for state, folder in spool.every():
-        if state in limits and now_s - folder.stat().st_mtime > limits[state] * _DAY_S:
-            shutil.rmtree(folder, ignore_errors=True)
-            removed.append(folder)
+    with held(spool.folder / "retention.lock", _BUSY):
+        ages = advance(_load(spool), now or Moment.now())
+        folders = [f"{state}/{folder.name}" for state, folder in spool.every() if state in limits_s]
+        folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
+        ages, old = due(ages, folders, limits_s)
+        removed = []
+        for name in old:
+            state, scan_id = name.split("/", 1)
+            if state == "scans":
+                if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
+                    spool.notes.remove(ScanId(scan_id))
+                continue
+            shutil.rmtree(spool.folder / name)
+            removed.append(spool.folder / name)
+        _save(spool, ages)
     return removed
 
 
+def _load(spool: Spool) -> Ages:
+    try:
+        document: dict[str, Any] = read_small(spool.folder / FILE, _MOST_BYTES)
+        seen = {str(name): float(value) for name, value in document["seen_s"].items()}
+        last = document["last"]
+        moment = Moment(float(last["wall_s"]), float(last["since_boot_s"]), str(last["boot"]))
+        return Ages(float(document["counted_s"]), moment, seen)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        # All begin to age now: that deletes late, never early.
+        return Ages()
+
+
+def _save(spool: Spool, ages: Ages) -> None:
+    kept = {n: s for n, s in ages.seen_s.items() if _exists(spool, n)}
+    write_json(spool.folder / FILE, asdict(replace(ages, seen_s=kept)))
+
+
+def _exists(spool: Spool, name: str) -> bool:
+    state, scan_id = name.split("/", 1)
+    if state == "scans":
+        return spool.notes.path(ScanId(scan_id)).exists()
+    return (spool.folder / name).exists()
+
+
+def traces(spool: Spool, scan_id: ScanId) -> list[Path]:
+    """Everything under the spool that bears a scan's name: folders, notes, locks, leftovers."""
+    found = []
+    for folder in sorted(spool.folder.iterdir()):
+        if folder.is_dir() and not folder.is_symlink():
+            found += [entry for entry in sorted(folder.iterdir()) if _names(entry.name, scan_id)]
+    return found
+
+
+def _names(name: str, scan_id: ScanId) -> bool:
+    plain = name.removeprefix(".")
+    return plain == scan_id or plain.startswith(f"{scan_id}.")
+
+
 def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
-    """Delete a scan, its bundle and its results.
+    """Delete a scan: its bundle, its results, its note and its name.
 
     Raises:
-        SpoolError: there is no such scan, or it is being reconstructed.
+        InputError: it is no scan id.
+        SpoolError: there is no such scan, or it is being taken or reconstructed.
     """
-    if spool.path("work", scan_id) in (folders := _folders(spool, scan_id)):
-        raise SpoolError(f"scan {scan_id} is being reconstructed; try again when it is done")
-    if not folders:
-        raise SpoolError(f"there is no scan {scan_id} in {spool.folder}")
-    for folder in folders:
-        shutil.rmtree(folder)
-    return folders
-
-
-def _folders(spool: Spool, scan_id: str) -> list[Path]:
-    return [folder for _, folder in spool.every() if folder.name == scan_id]
+    name = scan_id_of(scan_id)
+    lock = spool.lock(name)
+    try:
+        if lock is None or spool.path("work", name).exists():
+            raise SpoolError(f"scan {name} is being reconstructed; try again when it is done")
+        note = spool.notes.read(name)
+        if note is not None and note.stage in ("armed", "capturing"):
+            age_s = time.time() - spool.notes.path(name).stat().st_mtime
+            if spool.where(name) is None and 0.0 <= age_s < _ORDER_S:
+                raise SpoolError(f"scan {name} is being taken; try again when it is done")
+        found = [path for path in traces(spool, name) if path.parent.name != "locks"]
+        if not found:
+            raise SpoolError(f"there is no scan {name} in {spool.folder}")
+        for path in found:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        with held(
+            spool.folder / "retention.lock", SpoolError("old scans are being removed; again")
+        ):
+            _save(spool, _load(spool))
+    finally:
+        if lock is not None:
+            spool.unlock(name, lock)
+    return [path for path in found if path.parent.name in STATES]
 
 
 @click.command()
@@ -70,7 +207,7 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
     if old:
-        removed = expire_old(spool, config.retention, time.time())
+        removed = expire_old(spool, config.retention)
     elif scan_id:
         removed = purge_scan(spool, scan_id)
     else:
@@ -86,3 +223,18 @@ def _purge_label(spool: Spool, label: str) -> list[Path]:
     if not found:
         raise SpoolError(f"there is no scan with the label {label!r}; see station list")
     return [folder for scan in found for folder in purge_scan(spool, scan.scan_id)]
+
+
+@click.command()
+@click.argument("scan_id")
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+def retry(scan_id: str, config_path: Path | None) -> None:
+    """Reconstruct a failed scan again.
+
+    \b
+    Examples:
+      station retry 20261121T100000Z-7f3a
+    """
+    config = load_config(find_config(config_path))
+    Spool(config.spool.folder).retry(scan_id_of(scan_id))
+    click.echo(f"scan {scan_id} waits for its reconstruction")

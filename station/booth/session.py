@@ -1,26 +1,27 @@
-"""The states of a scan, from the operator's word to the fitting room.
+"""The states of a scan, from the operator's word to the fitting room (pure).
 
     armed -> capturing -> accepted -> reconstructing -> delivered | rescan | failed
       |          |
       +----------+-> failed (the person has to stay or come back)
 
-Once accepted a scan never goes back: its bundle is on disk.
+A scan's state follows from what is on disk: the folder that it lies in, then its note. Nobody
+remembers it, so a process that was killed forgets none. Only the sync process (and, once accepted,
+the worker) may say that a scan failed; until then what is not known is said to be unknown.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
+
+from station.core.scans import ScanNote
 
 State = Literal["armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"]
 FINAL: frozenset[State] = frozenset({"delivered", "rescan", "failed"})
 ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered", "rescan"})
 CANCELLED = "cancelled by the operator"
 """The reason of a scan that failed because it was given up."""
-_ORDER: dict[State, int] = {
-    "armed": 0, "capturing": 1, "accepted": 2, "reconstructing": 3,
-    "delivered": 4, "rescan": 4, "failed": 4,
-}  # fmt: skip
+UNSURE = "not known yet; do not scan again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,33 +30,38 @@ class Session:
 
     scan_id: str
     label: str
-    armed_s: float
-    """Host's monotonic time."""
-    state: State = "armed"
+    state: State
     framesets: int = 0
     wanted: int = 0
     reason: str = ""
+    path: str = ""
+    """Where its bundle or result lies; empty while it is taken, and when it was moved away."""
 
 
-def advance(
-    session: Session, state: State, *, framesets: int = 0, wanted: int = 0, reason: str = ""
-) -> Session:
-    """The session after an event; what is late, repeated or impossible changes nothing."""
-    if session.state in FINAL or _ORDER[state] < _ORDER[session.state]:
-        return session
-    return replace(
-        session,
-        state=state,
-        framesets=max(framesets, session.framesets),
-        wanted=max(wanted, session.wanted),
-        reason=reason or session.reason,
-    )
+def state_of(note: ScanNote | None, place: str | None) -> State | None:
+    """A scan's state; None if nobody knows the scan.
+
+    Args:
+        note: what is noted of it.
+        place: the spool's folder that it lies in.
+    """
+    if place == "outbox":
+        return "rescan" if note is not None and note.verdict == "rescan" else "delivered"
+    if place == "failed":
+        return "failed"
+    if place == "work":
+        return "reconstructing"
+    if place == "queue":
+        return "accepted"
+    if note is None:
+        return None
+    if note.stage == "delivered":
+        return "rescan" if note.verdict == "rescan" else "delivered"
+    if note.stage == "delivering":
+        return "reconstructing"
+    return note.stage
 
 
-def expire(session: Session, now_s: float, limit_s: float) -> Session:
-    """A scan that was not accepted in time has failed: nobody is collecting it any more."""
-    if session.state in ("armed", "capturing") and now_s - session.armed_s > limit_s:
-        return advance(
-            session, "failed", reason="the sync process ended during the scan; scan again"
-        )
-    return session
+def overdue(note: ScanNote, now_s: float, boot: str) -> bool:
+    """Whether an order should have been taken up by now; its verdict is still sync's to give."""
+    return note.stage == "armed" and (note.boot != boot or now_s > note.valid_until_s)

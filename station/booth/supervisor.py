@@ -1,24 +1,37 @@
-"""`station run`: all processes of a booth in the foreground, restarted when they die."""
+"""`station run`: all processes of a booth in the foreground, started again when they die or hang.
+
+The processes tell their progress as they tell systemd's: each has a socket that NOTIFY_SOCKET names
+(sd_notify). One that makes none for its time limit is killed and started again.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import socket
 import subprocess
 import sys
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import click
 
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.files import held
-from station.core.service import die_with_parent, stop_event
+from station.core.files import held, private_folder
+from station.core.service import die_with_parent, file_name, stop_event
+from station.messaging.transport import STATION_LOCK, endpoint
 
-_BACK_OFF_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0)
-_CALM_S = 30.0
+WATCHDOG_S = 10.0
+"""As in the systemd units. A main loop's longest step is far below a second."""
+_STARTING_S = 120.0
+"""Compiling the reconstruction for the first time takes most of a minute."""
+_BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+"""The frames of a camera that keeps dying are back within seconds, whatever its history."""
+_CALM_S = 10.0
 _STOP_S = 5.0
 
 
@@ -52,12 +65,51 @@ def services(config: BoothConfig, path: Path) -> list[Service]:
     return table
 
 
+class _Watch:
+    """Hears one process' signs of progress."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.path = str(folder / f"notify-{file_name(name)}")
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self.path)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._socket.bind(self.path)
+        self.begin()
+
+    def begin(self) -> None:
+        """A new process is started: what the old one said is forgotten."""
+        self._hear()
+        self._limit_s, self._last_s = _STARTING_S, time.monotonic()
+
+    def silent_for_s(self) -> float:
+        """By how much its time limit has passed; negative while it has not."""
+        self._hear()
+        return time.monotonic() - self._last_s - self._limit_s
+
+    def _hear(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                for word in self._socket.recv(4096).decode(errors="replace").splitlines():
+                    key, _, value = word.partition("=")
+                    if key == "READY":
+                        self._limit_s = WATCHDOG_S
+                    if key == "WATCHDOG_USEC" and value.isdigit():
+                        self._limit_s = int(value) / 1e6
+                    self._last_s = time.monotonic()
+
+    def close(self) -> None:
+        self._socket.close()
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self.path)
+
+
 class _Child:
     """One supervised process."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, folder: Path) -> None:
         self.service = service
         self.process: subprocess.Popen[bytes] | None = None
+        self.watch = _Watch(folder, service.name)
         self._failures = 0
         self._started_s = 0.0
         self._next_s = 0.0
@@ -66,6 +118,10 @@ class _Child:
         """Start it when it does not run, with growing pauses while it keeps dying."""
         now_s = time.monotonic()
         if self.process is not None and self.process.poll() is None:
+            if self.watch.silent_for_s() > 0.0:
+                click.echo(f"{self.service.name} hangs; it is killed", err=True)
+                self.process.kill()
+                self.process.wait()
             return
         if self.process is not None:
             self._failures = 0 if now_s - self._started_s > _CALM_S else self._failures + 1
@@ -79,8 +135,16 @@ class _Child:
             self.process = None
         if now_s >= self._next_s:
             self._started_s = now_s
+            self.watch.begin()
             self.process = subprocess.Popen(
-                self.service.command, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent
+                self.service.command,
+                stdin=subprocess.DEVNULL,
+                env={
+                    **os.environ,
+                    "NOTIFY_SOCKET": self.watch.path,
+                    "WATCHDOG_USEC": str(int(1e6 * WATCHDOG_S)),
+                },
+                preexec_fn=partial(die_with_parent, os.getpid()),
             )
 
     def stop(self) -> None:
@@ -88,9 +152,9 @@ class _Child:
             self.process.terminate()
 
 
-def supervise(table: list[Service], stop: threading.Event) -> None:
+def supervise(table: list[Service], folder: Path, stop: threading.Event) -> None:
     """Keep all services running until told to stop."""
-    children = [_Child(service) for service in table]
+    children = [_Child(service, folder) for service in table]
     try:
         while not stop.is_set():
             for child in children:
@@ -101,12 +165,12 @@ def supervise(table: list[Service], stop: threading.Event) -> None:
             child.stop()
         deadline_s = time.monotonic() + _STOP_S
         for child in children:
-            if child.process is None:
-                continue
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.process.wait(max(0.1, deadline_s - time.monotonic()))
-            if child.process.poll() is None:
-                child.process.kill()
+            if child.process is not None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.process.wait(max(0.1, deadline_s - time.monotonic()))
+                if child.process.poll() is None:
+                    child.process.kill()
+            child.watch.close()
 
 
 @click.command()
@@ -120,12 +184,14 @@ def run(config_path: Path | None) -> None:
     """
     path = find_config(config_path)
     config = load_config(path)
-    folder = config.runtime.folder
+    folder = private_folder(config.runtime.folder)
     busy = BoothError(f"a station runs already in {folder}; end it first (Ctrl-C in its terminal)")
-    with held(folder / "station.lock", busy):
+    with held(folder / STATION_LOCK, busy):
         click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
         if not config.calibration.exists():
             click.echo(
                 f"{config.calibration} is missing: station calibrate comes before the first scan"
             )
-        supervise(services(config, path.resolve()), stop_event())
+        # Sockets lie where their path is short enough for the kernel.
+        sockets = Path(endpoint(folder, "notify").removeprefix("ipc://")).parent
+        supervise(services(config, path.resolve()), sockets, stop_event())

@@ -1,115 +1,95 @@
-"""The sync-and-merge process: framesets by hardware time, the live cloud, and scan bundles."""
+"""The sync-and-merge process: framesets by hardware time, the live cloud, and scans' verdicts."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from collections import deque
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 import zmq
-from numpy.typing import NDArray
 
+from station.booth.collection import LATE, Collection, Order
 from station.booth.frameset import Frameset, FramesetMatcher
-from station.booth.live import merged_points
+from station.booth.live import LiveCloud
+from station.booth.scan_writer import Begun, Ended, ScanWriter
+from station.booth.sensor_truth import CameraTruth, wrong_sensors
 from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
-from station.core.bundle import CapturedFrame, write_bundle
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.errors import BoothError, CalibrationError
-from station.core.rig import Rig
-from station.core.service import notify, set_up_logs, stop_event
-from station.core.spool import Spool
-from station.messaging.messages import CameraHealth, FrameHeader, Reply, Request, ScanEvent
-from station.messaging.transport import publisher, server, subscriber
+from station.core.errors import BoothError
+from station.core.files import held
+from station.core.scans import ScanId, scan_id_of
+from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.messaging.intake import FrameIntake, LiveFrame
+from station.messaging.messages import Reply, Request, ScanEvent
+from station.messaging.transport import publisher, server
 
 _POLL_MS = 20
 _LATENCIES_KEPT = 2000
-
-
-@dataclass(frozen=True, slots=True)
-class LiveFrame:
-    """A frame as it came: the pixels are the message's own memory."""
-
-    header: FrameHeader
-    depth: NDArray[np.uint16]
-
-
-@dataclass(slots=True)
-class Collection:
-    """A scan being collected."""
-
-    scan_id: str
-    label: str
-    deadline_s: float
-    sets: list[Frameset[LiveFrame]] = field(default_factory=list)
-    complete_s: float = 0.0
-    """Time at which its last frameset came."""
+_ENDED_KEPT = 100
 
 
 class SyncProcess:
-    """Matches frames, publishes what is seen, writes bundles when told to."""
+    """Connects the parts: frames to framesets, framesets to scans, orders to verdicts."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
         self._names = [camera.name for camera in config.cameras]
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         folder = config.runtime.folder
-        self._frames_in = subscriber(
-            self._context, folder, [f"camera-{name}" for name in self._names], ["depth", "health"]
-        )
+        self._intake = FrameIntake(self._context, folder, self._names)
         self._commands = server(self._context, folder, "sync")
         self._events = publisher(self._context, folder, "events", "scan")
-        self._events_lock = threading.Lock()
         self._matcher: FramesetMatcher[LiveFrame] = FramesetMatcher(
             self._names, config.sync.tolerance_s
         )
-        self._last_frame_s: dict[str, float] = {}
-        self._health: dict[str, CameraHealth] = {}
+        self._truth = {name: CameraTruth() for name in self._names}
+        self._serials: dict[str, str] = {}
+        self._live = LiveCloud(config.calibration, config.sync.live_hz)
+        drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration), log)
+        self._writer = ScanWriter(config, drift, log)
+        self._order: Order | None = None
+        """Taken up; its scan is not collected yet."""
         self._collection: Collection | None = None
-        self._writer = ThreadPoolExecutor(max_workers=1)
-        self._writing: dict[str, Future[None]] = {}
-        self._ended: dict[str, ScanEvent] = {}
+        self._writing: dict[ScanId, Order] = {}
+        self._cancelled: set[ScanId] = set()
+        self._ended: deque[Ended] = deque(maxlen=_ENDED_KEPT)
         self._set_count = 0
-        self._latencies_s: list[float] = []
-        self._live_s = 0.0
-        self._rig: Rig | None = None
-        self._drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration), log)
+        self._latencies_s: deque[float] = deque(maxlen=_LATENCIES_KEPT)
+        self._heart = Heartbeat(folder, "sync")
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
         poller = zmq.Poller()
-        poller.register(self._frames_in, zmq.POLLIN)
+        poller.register(self._intake.socket, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
-        notify("READY=1")
+        self._heart.ready()
         while not stop.is_set():
             ready = dict(poller.poll(_POLL_MS))
-            if self._frames_in in ready:
+            if self._intake.socket in ready:
                 self._take_frames()
             if self._commands in ready:
                 self._answer()
+            for event in self._writer.events():
+                self._hear(event)
             self._watch_collection()
-        self._writer.shutdown(wait=True)
+            self._heart.beat()
+            if self._heart.due:
+                self._heart.tell(self._health())
+        self._writer.close()
         self._context.destroy(linger=0)
 
     def _take_frames(self) -> None:
-        while self._frames_in.poll(0):
-            topic, packed, *body = self._frames_in.recv_multipart(copy=False)
-            if bytes(topic.buffer).startswith(b"health/"):
-                health = CameraHealth.unpack(packed.buffer)
-                self._health[health.camera] = health
+        for frame in self._intake.frames():
+            header = frame.header
+            self._serials[header.camera] = header.serial
+            if not self._truth[header.camera].usable(header, frame.depth):
                 continue
-            header = FrameHeader.unpack(packed.buffer)
-            depth = np.frombuffer(body[0].buffer, np.uint16).reshape(header.height, header.width)
-            self._last_frame_s[header.camera] = time.monotonic()
-            frame = LiveFrame(header, depth)
             for found in self._matcher.push(header.camera, header.host_time_s, frame):
                 self._use(found)
 
@@ -118,206 +98,145 @@ class SyncProcess:
         now_s = time.monotonic()
         newest_s = max(frame.header.received_s for frame in found.frames.values())
         self._latencies_s.append(now_s - newest_s)
-        del self._latencies_s[:-_LATENCIES_KEPT]
-        if self._collection is not None:
-            self._collection.sets.append(found)
-            self._tell(self._collection, "capturing")
-            if len(self._collection.sets) >= self._config.scan.framesets:
-                self._collection.complete_s = now_s
-                self._write(self._collection)
+        collection = self._collection
+        if collection is not None:
+            complete = collection.add(found, now_s)
+            self._tell(collection, "writing" if complete else "capturing")
+            if complete:
                 self._collection = None
-        if now_s - self._live_s > 1.0 / self._config.sync.live_hz:
-            self._live_s = now_s
-            self._publish_cloud(found)
+                self._writing[collection.order.scan_id] = collection.order
+                self._writer.write(collection)
+        points = self._live.points(found, now_s)
+        if points is not None:
+            self._events.send_multipart([b"cloud", points.tobytes()])
 
-    def _publish_cloud(self, found: Frameset[LiveFrame]) -> None:
-        if self._rig is None:
-            try:
-                self._rig = Rig.load(self._config.calibration)
-            except BoothError:
-                return
-        known = {n: f.depth for n, f in found.frames.items() if n in self._rig.cameras}
-        scale_m = next(iter(found.frames.values())).header.depth_scale_m
-        points = merged_points(self._rig, known, scale_m)
-        self._publish(b"cloud", points.tobytes())
+    def _hear(self, event: Begun | Ended) -> None:
+        if isinstance(event, Ended):
+            self._ended.append(event)
+            told = ScanEvent(
+                event.scan_id, "accepted" if event.accepted else "failed", 0, 0, event.reason
+            )
+            self._events.send_multipart([b"scan", told.pack()])
+            self._writing.pop(event.scan_id, None)
+            self._cancelled.discard(event.scan_id)
+            if self._order is not None and self._order.scan_id == event.scan_id:
+                self._order = None
+            return
+        self._order = None
+        if event.order.scan_id in self._cancelled:
+            self._fail(event.order, CANCELLED)
+            return
+        self._matcher.clear()
+        scan = self._config.scan
+        deadline_s = time.monotonic() + scan.max_duration_s
+        self._collection = Collection(event.order, event.rig, scan.framesets, deadline_s)
+        self._live.rig = event.rig
+        wrong = wrong_sensors(
+            self._serials, {name: event.rig.cameras[name].serial for name in self._names}
+        )
+        if wrong:
+            self._collection = None
+            self._fail(event.order, "; ".join(wrong))
+        else:
+            self._tell(self._collection, "capturing")
 
     def _watch_collection(self) -> None:
         collection = self._collection
         if collection is None or time.monotonic() < collection.deadline_s:
             return
         self._collection = None
-        silent = self._silent()
-        wanted = self._config.scan.framesets
-        reason = (
-            f"camera {', '.join(silent)} went silent; check its cable and scan again"
-            if silent
-            else f"only {len(collection.sets)} of {wanted} framesets came in "
-            f"{self._config.scan.max_duration_s:g} s; check station status and scan again"
+        reason = collection.too_few(
+            self._silent(), self._troubles(), self._config.scan.max_duration_s
         )
-        self._end(collection, "failed", reason)
+        self._fail(collection.order, reason)
+
+    def _fail(self, order: Order, reason: str) -> None:
+        self._writing[order.scan_id] = order
+        self._writer.fail(order, reason)
 
     def _silent(self) -> list[str]:
+        return self._intake.silent(self._config.sync.silent_after_s)
+
+    def _troubles(self) -> list[str]:
         now_s = time.monotonic()
-        limit_s = self._config.sync.silent_after_s
-        return [n for n in self._names if now_s - self._last_frame_s.get(n, -1e9) > limit_s]
+        return [
+            f"camera {name}: {trouble}"
+            for name in self._names
+            if (trouble := self._truth[name].trouble(now_s))
+        ]
 
     def _answer(self) -> None:
         *route, packed = self._commands.recv_multipart()
         try:
-            request = Request.unpack(packed)
-            reply = self._reply(request)
+            reply = self._reply(Request.unpack(packed))
         except BoothError as error:
             reply = Reply(ok=False, error=str(error))
         self._commands.send_multipart([*route, reply.pack()])
 
     def _reply(self, request: Request) -> Reply:
         if request.command == "scan":
-            self._start_collection(request.scan_id, request.label)
+            order = Order(scan_id_of(request.scan_id), request.label, request.valid_until_s)
+            self._take_up(order)
             return Reply(ok=True)
         if request.command == "cancel":
-            return self._cancel(request.scan_id)
-        if request.command == "status":
-            return Reply(ok=True, content=self._status())
-        return Reply(ok=False, error=f"sync knows no command {request.command!r}")
+            return self._cancel(scan_id_of(request.scan_id))
+        return Reply(ok=False, error=f"sync knows no command {request.command!a:.80}")
 
-    def _start_collection(self, scan_id: str, label: str) -> None:
-        """Begin a scan, or go on with it if it is known already.
-
-        Raises:
-            BoothError: it cannot be taken now; nothing was begun.
-        """
-        current = self._collection
-        if scan_id in self._ended or scan_id in self._writing:
+    def _take_up(self, order: Order) -> None:
+        """Begin a scan, or refuse it with the reason; the verdict is on disk either way."""
+        if order.scan_id in self._in_hand():
             return
-        if current is not None:
-            if current.scan_id == scan_id:
-                return
-            raise BoothError("another scan is being taken; wait for it to end")
-        silent = self._silent()
-        if silent:
-            raise BoothError(
-                f"camera {', '.join(silent)} gives no frames{self._why(silent[0])}; "
-                "run station start, or check the cable"
-            )
-        spool = Spool(self._config.spool.folder)
-        spool.check_space(self._config.spool.min_free_mb)
-        self._rig = Rig.load(self._config.calibration)
-        for name in self._names:
-            self._rig.camera(name, str(self._config.calibration))
-        self._matcher.clear()
-        deadline_s = time.monotonic() + self._config.scan.max_duration_s
-        self._collection = Collection(scan_id, label, deadline_s)
-        self._tell(self._collection, "capturing")
+        if order.late(time.monotonic()):
+            self._writer.refuse(order, LATE)
+        elif reason := self._unready():
+            self._writer.refuse(order, reason)
+        else:
+            self._order = order
+            self._writer.begin(order)
 
-    def _cancel(self, scan_id: str) -> Reply:
+    def _in_hand(self) -> set[ScanId]:
+        found = set(self._writing)
+        if self._order is not None:
+            found.add(self._order.scan_id)
+        if self._collection is not None:
+            found.add(self._collection.order.scan_id)
+        return found
+
+    def _unready(self) -> str:
+        """Why no scan can be taken now, or nothing."""
+        if self._order is not None or self._collection is not None:
+            current = self._order or (self._collection and self._collection.order)
+            return f"scan {current and current.scan_id} is being taken; wait until it is done"
+        if silent := self._silent():
+            return "; ".join(
+                f"camera {name} gives no frames{self._intake.why(name)}; "
+                "check its cable, see station status"
+                for name in silent
+            )
+        return "; ".join(self._troubles())
+
+    def _cancel(self, scan_id: ScanId) -> Reply:
         """Collect a scan no further; what was collected is dropped."""
+        if self._order is not None and self._order.scan_id == scan_id:
+            self._cancelled.add(scan_id)
+            return Reply(ok=True)
         collection = self._collection
-        if collection is None or collection.scan_id != scan_id:
+        if collection is None or collection.order.scan_id != scan_id:
             return Reply(ok=False, error=f"scan {scan_id} is not being taken")
         self._collection = None
-        self._end(collection, "failed", CANCELLED)
+        self._fail(collection.order, CANCELLED)
         return Reply(ok=True)
 
-    def _why(self, camera: str) -> str:
-        health = self._health.get(camera)
-        return f" ({health.detail or health.state})" if health else ""
+    def _tell(self, collection: Collection, state: str) -> None:
+        count = len(collection.sets)
+        event = ScanEvent(collection.order.scan_id, state, count, collection.wanted)
+        self._events.send_multipart([b"scan", event.pack()])
 
-    def _write(self, collection: Collection) -> None:
-        rig = self._rig
-        assert rig is not None
-        writing = self._writer.submit(self._write_bundle, collection, rig)
-        self._writing[collection.scan_id] = writing
-        writing.add_done_callback(lambda done: self._written(collection, done))
-
-    def _write_bundle(self, collection: Collection, rig: Rig) -> None:
-        if self._config.drift.refuse_scans:
-            self._refuse_moved_cameras(collection, rig)
-        spool = Spool(self._config.spool.folder)
-        temporary = spool.temporary(collection.scan_id)
-        frames = {
-            name: [
-                CapturedFrame(
-                    frame.depth,
-                    frame.header.device_ticks,
-                    frame.header.tick_hz,
-                    frame.header.host_time_s,
-                    frame.header.sequence,
-                )
-                for frame in (found.frames[name] for found in collection.sets)
-            ]
-            for name in self._names
-        }
-        first = next(iter(collection.sets[0].frames.values()))
-        write_bundle(
-            temporary,
-            scan_id=collection.scan_id,
-            created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-            label=collection.label,
-            depth_scale_m=first.header.depth_scale_m,
-            rig=rig,
-            frames=frames,
-            spread_s_max=max(found.spread_s for found in collection.sets),
-        )
-        spool.submit(temporary, collection.scan_id)
-
-    def _refuse_moved_cameras(self, collection: Collection, rig: Rig) -> None:
-        """A scan through a wrong calibration is worth nothing: say so while the person is there.
-
-        Raises:
-            CalibrationError: naming the cameras that moved.
-        """
-        moved = [
-            move.words()
-            for name in self._names
-            for move in self._drift.moves(
-                rig.cameras[name],
-                [found.frames[name].depth for found in collection.sets],
-                collection.sets[0].frames[name].header.depth_scale_m,
-            )
-            if move.moved or move.lost
-        ]
-        if moved:
-            raise CalibrationError(
-                f"{'; '.join(moved)}; look at it, then run station check, or station calibrate"
-            )
-
-    def _written(self, collection: Collection, done: Future[None]) -> None:
-        error = done.exception()
-        if error is None:
-            self._log.info(
-                "scan %s written %.2f s after its last frameset",
-                collection.scan_id,
-                time.monotonic() - collection.complete_s,
-            )
-            self._end(collection, "accepted", "")
-        elif isinstance(error, BoothError):
-            self._end(collection, "failed", str(error))
-        else:
-            self._end(collection, "failed", f"the scan could not be written ({error}); scan again")
-
-    def _end(self, collection: Collection, state: str, reason: str) -> None:
-        event = self._tell(collection, state, reason)
-        self._ended[collection.scan_id] = event
-        for old in list(self._ended)[:-100]:
-            del self._ended[old]
-        self._writing.pop(collection.scan_id, None)
-        self._log.info("scan %s %s %s", collection.scan_id, state, reason)
-
-    def _tell(self, collection: Collection, state: str, reason: str = "") -> ScanEvent:
-        event = ScanEvent(
-            collection.scan_id, state, len(collection.sets), self._config.scan.framesets, reason
-        )
-        self._publish(b"scan", event.pack())
-        return event
-
-    def _publish(self, topic: bytes, content: bytes) -> None:
-        """The writer's thread publishes too; a socket is one thread's at a time."""
-        with self._events_lock:
-            self._events.send_multipart([topic, content])
-
-    def _status(self) -> dict[str, Any]:
-        current = self._collection
+    def _health(self) -> dict[str, Any]:
+        now_s = time.monotonic()
+        silent = self._silent()
         latencies = sorted(self._latencies_s)
+        collection = self._collection
         return {
             "cameras": {
                 name: {
@@ -325,19 +244,27 @@ class SyncProcess:
                     "detail": health.detail,
                     "frames": health.frames,
                     "lost": health.lost,
+                    "unmatched": self._matcher.dropped[name],
                     "clock_resets": health.clock_resets,
-                    "silent": name in self._silent(),
+                    "silent": name in silent,
+                    "last_frame_age_s": now_s - self._intake.last_frame_s.get(name, now_s),
+                    "rate_hz": self._truth[name].rate_hz(),
+                    "trouble": self._truth[name].trouble(now_s),
                 }
                 for name in self._names
-                if (health := self._health.get(name))
+                if (health := self._intake.health.get(name))
             },
-            "silent": self._silent(),
+            "silent": silent,
             "framesets": self._set_count,
             "latency_p50_s": latencies[len(latencies) // 2] if latencies else None,
             "latency_p99_s": latencies[int(0.99 * len(latencies))] if latencies else None,
-            "collecting": None if current is None else [current.scan_id, len(current.sets)],
-            "writing": [name for name, done in self._writing.items() if not done.done()],
-            "ended": {event.scan_id: event.state for event in self._ended.values()},
+            "collecting": None
+            if collection is None
+            else [collection.order.scan_id, len(collection.sets)],
+            "writing": list(self._writing),
+            "ended": {e.scan_id: "accepted" if e.accepted else "failed" for e in self._ended},
+            "unreadable_messages": self._intake.unreadable,
+            "last_unreadable": self._intake.last_problem,
         }
 
 
@@ -351,4 +278,6 @@ def sync(config_path: Path | None) -> None:
       station sync --config booth.toml
     """
     config = load_config(find_config(config_path))
-    SyncProcess(config, set_up_logs("sync")).run(stop_event())
+    lock = config.runtime.folder / "sync.lock"
+    with held(lock, BoothError(f"a sync process runs already here ({lock}); end it first")):
+        SyncProcess(config, set_up_logs("sync")).run(stop_event())

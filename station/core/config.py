@@ -175,6 +175,12 @@ def _section() -> Any:
     return Field(default_factory=dict)
 
 
+class MetricsConfig(Strict):
+    """Prometheus metrics, for this machine alone."""
+
+    port: int = Field(default=0, ge=0, le=65535, description="on 127.0.0.1; 0: none are served")
+
+
 class BoothConfig(Strict):
     """A whole booth."""
 
@@ -192,6 +198,7 @@ class BoothConfig(Strict):
     runtime: RuntimeConfig = _section()
     console: ConsoleConfig = _section()
     deliver: tuple[DeliverConfig, ...] = ()
+    metrics: MetricsConfig = _section()
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:

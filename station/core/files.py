@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
+import stat
+import time
 import uuid
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -15,6 +18,9 @@ from station.core.errors import BoothError, FormatError
 
 PRIVATE_FOLDER_MODE = 0o700
 """Body scans are personal data: nobody but the service's user reads them."""
+_LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
+MOST_JSON_BYTES = 16 << 20
+"""A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
 
 
 def fsync_folder(folder: Path) -> None:
@@ -51,33 +57,95 @@ def held(path: Path, busy: BoothError) -> Iterator[None]:
     private_folder(path.parent)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise busy from None
+        for left in reversed(range(_LOCK_TRIES)):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                # `is_held` takes it for an instant.
+                if left == 0:
+                    raise busy from None
+                time.sleep(_LOCK_PAUSE_S)
         yield
     finally:
         os.close(descriptor)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old content or the new, never a part."""
+def is_held(path: Path) -> bool:
+    """Whether a living process holds a lock file (see `held`)."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file: no link is followed, no device or pipe is read.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no regular file, or larger than ``most_bytes``.
+        OSError: the disk does not give it.
+    """
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags)
+    except OSError as cause:
+        if cause.errno == errno.ELOOP:
+            raise ValueError("is a link, not a file") from None
+        raise
+    with os.fdopen(descriptor, "rb") as stream:
+        status = os.fstat(stream.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("is not a regular file")
+        if status.st_size > most_bytes:
+            raise ValueError(f"has {status.st_size} bytes, at most {most_bytes} are read")
+        return stream.read(most_bytes + 1)
+
+
+def read_small(path: Path, most_bytes: int) -> Any:
+    """A JSON document of bounded size.
+
+    Raises:
+        FileNotFoundError, OSError: as read_regular.
+        ValueError: it is no regular file, too large, or no JSON (nested too deeply, too).
+    """
+    try:
+        return json.loads(read_regular(path, most_bytes))
+    except RecursionError:
+        raise ValueError("is nested too deeply") from None
+
+
+def write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, never a part.
+
+    Without ``durable`` it survives the end of the process, but not always a loss of power.
+    """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         with temporary.open("wb") as stream:
             stream.write(data)
             stream.flush()
-            os.fsync(stream.fileno())
+            if durable:
+                os.fsync(stream.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    fsync_folder(path.parent)
+    if durable:
+        fsync_folder(path.parent)
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write JSON durably and atomically; NaN and infinity are refused (they are not JSON)."""
+def write_json(path: Path, document: Any, *, durable: bool = True) -> None:
+    """Write JSON atomically; NaN and infinity are refused (they are not JSON)."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
-    write_bytes(path, (text + "\n").encode())
+    write_bytes(path, (text + "\n").encode(), durable=durable)
 
 
 def read_json(
@@ -90,11 +158,12 @@ def read_json(
     """Read a JSON document of a known format and version.
 
     Raises:
-        FormatError (or the subclass ``error``): the file is missing, torn, of another format, or
-            of a version not in ``versions``; the message names the file and what was found.
+        FormatError (or the subclass ``error``): the file is missing, torn, too large, a link, of
+            another format, or of a version not in ``versions``; the message names the file and
+            what was found.
     """
     try:
-        document = json.loads(path.read_bytes())
+        document = read_small(path, MOST_JSON_BYTES)
     except FileNotFoundError:
         raise error(f"{path} is missing; a {format} file was expected there") from None
     except (OSError, ValueError) as cause:
@@ -105,7 +174,7 @@ def read_json(
     if found != format:
         raise error(f"{path} is not a {format} file (its format is {found!r})")
     version = document.get("version")
-    if isinstance(version, bool) or version not in versions:
+    if not isinstance(version, int) or isinstance(version, bool) or version not in versions:
         readable = ", ".join(str(known) for known in sorted(versions))
         raise error(f"{path} has {format} version {version!r}; this program reads {readable}")
     return dict(document)

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from station.core.errors import BoothError
+from station.core.service import set_up_caches
 
 _OPTIONAL = {
     "open3d": "this needs open3d, which a booth does without; apt install body-booth-simulation, "
@@ -47,6 +48,7 @@ class LazyGroup(click.Group):
 
 def run(group: click.Group) -> None:
     """Call a command; an error that the user can act upon becomes one line and exit code 1."""
+    set_up_caches()
     try:
         group()
     except BoothError as error:

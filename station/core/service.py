@@ -1,17 +1,42 @@
-"""The life of every process: signals, logs, readiness, death with its parent."""
+"""The life of every process: signals, logs, caches, readiness, progress, death with its parent.
+
+A process tells its supervisor (systemd, or `station run`, by the same protocol) when it is ready,
+and from then on that it makes progress: `Heartbeat.beat` is called where work is done, not by a
+timer, so that a process that hangs is replaced. Beside that it writes what it knows of itself to
+`health/<process>.json` in the runtime folder; `station status` and the metrics are made from there,
+whether the process still answers or not.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import logging
 import os
 import signal
 import socket
 import sys
+import tempfile
 import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
+import platformdirs
+
+from station.core.files import private_folder, read_small
+
+CACHE_VARIABLE = "BOOTH_CACHE"
+"""Names the folder of all caches; the user's cache folder if unset."""
+HEALTH = "health"
+_CODE = Path(__file__).parent
+_NUMBA_VARIABLE = "NUMBA_CACHE_DIR"
 _PR_SET_PDEATHSIG = 1
+_BEAT_PERIOD_S = 0.5
+_HEALTH_PERIOD_S = 0.25
+_MOST_HEALTH_BYTES = 1 << 20
 
 
 def stop_event() -> threading.Event:
@@ -34,19 +59,121 @@ def set_up_logs(process: str) -> logging.Logger:
     return logging.getLogger(process)
 
 
+def set_up_caches() -> None:
+    """Let compiled code be kept where this process may write; call it before numba is imported.
+
+    In $BOOTH_CACHE if that is set, else beside the code (numba's own way), else in the user's cache
+    folder, else in a private one for temporary files.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if not chosen and os.access(_CODE, os.W_OK):
+        return
+    folder = Path(chosen) if chosen else platformdirs.user_cache_path("body-booth")
+    if not _takes_files(folder):
+        folder = Path(tempfile.gettempdir()) / f"body-booth-cache-{os.getuid()}"
+        os.environ[CACHE_VARIABLE] = str(private_folder(folder))
+    os.environ.setdefault(_NUMBA_VARIABLE, str(folder / "numba"))
+
+
+def _takes_files(folder: Path) -> bool:
+    try:
+        private_folder(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
 def notify(state: str) -> None:
-    """Tell systemd (sd_notify): "READY=1", "WATCHDOG=1"; nothing where nobody listens."""
+    """Tell the supervisor (sd_notify): "READY=1", "WATCHDOG=1"; nothing where nobody listens."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+    kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as sock:
         sock.connect("\0" + address[1:] if address.startswith("@") else address)
         sock.send(state.encode())
 
 
-def die_with_parent() -> None:
-    """Ask the kernel to end this process when its parent ends (Linux)."""
+class Heartbeat:
+    """A process' sign of progress and its word about itself.
+
+    The health file is written by a thread of its own: a stalled disk must not stop a main loop.
+    """
+
+    def __init__(self, runtime_folder: Path, process: str) -> None:
+        self._path = private_folder(runtime_folder / HEALTH) / f"{file_name(process)}.json"
+        self._process = process
+        self._content: dict[str, Any] = {}
+        self._beat_s = self._told_s = 0.0
+        self._new = threading.Event()
+        threading.Thread(target=self._write, name="health", daemon=True).start()
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time for new health."""
+        return time.monotonic() - self._told_s >= _HEALTH_PERIOD_S
+
+    def ready(self) -> None:
+        """The process does its work from here on."""
+        notify("READY=1")
+        self.beat()
+
+    def beat(self) -> None:
+        """Work was done, or there was none to do. Cheap: call it in every round."""
+        now_s = time.monotonic()
+        if now_s - self._beat_s >= _BEAT_PERIOD_S:
+            self._beat_s = now_s
+            notify("WATCHDOG=1")
+
+    def allow(self, seconds: float | None) -> None:
+        """Let the process be without progress for longer; None: as long as usual again."""
+        usual_us = int(os.environ.get("WATCHDOG_USEC", "0") or 0)
+        limit_us = usual_us if seconds is None else int(1e6 * seconds)
+        if usual_us:
+            notify(f"WATCHDOG_USEC={limit_us}\nWATCHDOG=1")
+
+    def tell(self, content: Mapping[str, Any]) -> None:
+        """Replace what the process says of itself; see `due`."""
+        self._told_s = time.monotonic()
+        self._content = {
+            "process": self._process,
+            "pid": os.getpid(),
+            "told_s": self._told_s,
+            **content,
+        }
+        self._new.set()
+
+    def _write(self) -> None:
+        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        while self._new.wait():
+            self._new.clear()
+            with contextlib.suppress(OSError):
+                temporary.write_text(json.dumps(self._content))
+                temporary.replace(self._path)
+
+
+def file_name(process: str) -> str:
+    """A process' name ("capture front-lower") as a file's."""
+    return process.replace(" ", "-")
+
+
+def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
+    """What a process said of itself last, with `age_s`, the seconds since; empty if nothing."""
+    path = runtime_folder / HEALTH / f"{file_name(process)}.json"
+    try:
+        content = read_small(path, _MOST_HEALTH_BYTES)
+        # Of an earlier boot, monotonic times mean nothing.
+        age_s = time.monotonic() - float(content["told_s"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return {**content, "age_s": age_s} if age_s >= 0.0 else {}
+
+
+def die_with_parent(parent: int) -> None:
+    """Ask the kernel to end this process when its parent (a process id) ends (Linux)."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() == 1:
-        sys.exit(1)
+    if os.getppid() != parent:
+        # It ended before the kernel was asked.
+        os._exit(1)

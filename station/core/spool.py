@@ -1,6 +1,7 @@
 """The spool: where scans wait, are worked on and are delivered. Disk is the truth.
 
     tmp/       being written
+    scans/     what is noted of each scan (`station.core.scans`)
     queue/     accepted scans (bundles)
     work/      claimed by a worker
     outbox/    results, whole or not at all
@@ -8,28 +9,33 @@
     done/      bundles of delivered scans, until retention removes them
 
 A worker claims a scan by a file lock and a rename. A dead process drops its lock, and any peer
-puts the scan back with one more try. Locks and renames need one local file system.
+puts the scan back. Locks and renames need one local file system.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
-import json
+import logging
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from station.core.errors import SpoolError
-from station.core.files import fsync_folder, private_folder, publish_folder, write_json
+from station.core.files import fsync_folder, private_folder, publish_folder, read_small, write_json
+from station.core.scans import Notes, ScanId, ScanNote, Stage, boot_id, is_scan_id
 
 STATES = ("queue", "work", "outbox", "failed", "done")
 REASON = "reason.json"
+MOST_DEATHS = 10
+"""Ends of the station, not of a job, cost a scan none of its tries; a scan that ends the station so
+often is given up."""
 _BUNDLE_BYTES = 40 << 20
 """More than forty depth frames take."""
-_LEFTOVER_AGE_S = 600.0
+_LOG = logging.getLogger("spool")
 
 
 def count_scans(folder: Path) -> dict[str, int]:
@@ -50,6 +56,9 @@ class Spool:
         self.folder = folder
         for name in ("tmp", "locks", *STATES):
             private_folder(folder / name)
+        self.notes = Notes(folder / "scans")
+        self.released: set[ScanId] = set()
+        """Claims that this process dropped: their worker did not die."""
 
     def path(self, state: str, scan_id: str) -> Path:
         return self.folder / state / scan_id
@@ -62,7 +71,7 @@ class Spool:
         """Refuse a scan before it is taken, rather than lose it after.
 
         Raises:
-            SpoolError: naming the folder and the space that is missing.
+            SpoolError: naming the folder and the space that is missing, or why it takes no files.
         """
         free = shutil.disk_usage(self.folder).free
         needed = min_free_mb * 1e6 + _BUNDLE_BYTES
@@ -73,10 +82,11 @@ class Spool:
             )
 
     def where(self, scan_id: str) -> str | None:
-        """The state of a scan, or None if it is unknown.
+        """The state of a scan, or None if it is in none of the folders.
 
-        Folders are looked through in the order in which a scan passes them, and once more: a scan
-        that is being renamed is in one of them at any moment, but not always in the one looked at.
+        Folders are looked through against the order in which a scan passes them, and once more: a
+        scan that is being renamed is in one of them at any moment, but not always in the one that
+        is looked at.
         """
         for _ in range(2):
             for state in ("outbox", "failed", "work", "queue"):
@@ -84,72 +94,161 @@ class Spool:
                     return state
         return None
 
+    def note(self, scan_id: ScanId) -> ScanNote:
+        """The note of a scan; of one that came without an order, a new one."""
+        return self.notes.read(scan_id) or ScanNote(scan_id, "accepted")
+
     def submit(self, temporary: Path, scan_id: str) -> None:
         """Accept a finished bundle: from here on nothing short of losing the disk loses it.
 
-        The same scan twice is one scan.
+        The same scan twice is one scan, also after its result was moved away.
+
+        Raises:
+            SpoolError: the id cannot name a scan.
+            OSError: the disk refused; `where` tells whether the scan was accepted all the same.
         """
-        if self.where(scan_id) is not None:
+        if not is_scan_id(scan_id):
+            raise SpoolError(f"{scan_id!a:.80} is no scan id; the bundle is not accepted")
+        note = self.notes.read(ScanId(scan_id))
+        known = note is not None and note.stage in ("delivering", "delivered")
+        if known or self.where(scan_id) is not None:
             shutil.rmtree(temporary, ignore_errors=True)
             return
         publish_folder(temporary, self.path("queue", scan_id))
 
-    def waiting(self) -> list[str]:
-        """Scan ids in the queue, oldest first."""
-        return sorted(entry.name for entry in (self.folder / "queue").iterdir() if entry.is_dir())
+    def waiting(self) -> list[ScanId]:
+        """Scan ids in the queue, oldest first; what is no bundle's folder is left alone."""
+        return self._scans_in("queue")
+
+    def _scans_in(self, state: str) -> list[ScanId]:
+        with os.scandir(self.folder / state) as entries:
+            return sorted(
+                ScanId(entry.name)
+                for entry in entries
+                if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
+            )
 
     def claim(self) -> Claim | None:
-        """Take the oldest waiting scan that nobody else takes."""
+        """Take the oldest waiting scan that nobody else takes.
+
+        Raises:
+            OSError: the disk does not let any waiting scan be claimed.
+        """
+        problem: OSError | None = None
         for scan_id in self.waiting():
-            lock = self._lock(scan_id)
-            if lock is None:
+            try:
+                claim = self._claim(scan_id)
+            except OSError as error:
+                problem = error
                 continue
+            if claim is not None:
+                return claim
+        if problem is not None:
+            raise problem
+        return None
+
+    def _claim(self, scan_id: ScanId) -> Claim | None:
+        lock = self.lock(scan_id)
+        if lock is None:
+            return None
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.unlock, scan_id, lock)
+            if self.path("work", scan_id).exists():
+                # The same scan once more, while a dead worker's waits to be put back: one is kept.
+                shutil.rmtree(self.path("queue", scan_id))
+                return None
+            note = self.note(scan_id)
             try:
                 os.rename(self.path("queue", scan_id), self.path("work", scan_id))
             except FileNotFoundError:
-                os.close(lock)
-                continue
-            return Claim(self, scan_id, lock, self._count_try(scan_id))
-        return None
+                return None
+            undo.pop_all()
+            return Claim(self, scan_id, lock, note)
 
     def withdraw(self, scan_id: str, reason: str) -> bool:
         """Take a waiting scan off the queue into failed/; False if it does not wait (any more)."""
-        lock = self._lock(scan_id)
-        if lock is None:
+        if not is_scan_id(scan_id) or not self.path("queue", scan_id).exists():
             return False
-        try:
-            os.rename(self.path("queue", scan_id), self.path("work", scan_id))
-        except FileNotFoundError:
-            os.close(lock)
+        claim = self._claim(ScanId(scan_id))
+        if claim is None:
             return False
-        Claim(self, scan_id, lock, self._tries(scan_id)).fail(reason)
+        claim.fail(reason)
         return True
 
-    def recover(self, retries: int) -> list[str]:
+    def retry(self, scan_id: ScanId) -> None:
+        """Put a failed scan back into the queue, its tries forgotten.
+
+        Raises:
+            SpoolError: it is not in failed/.
+        """
+        bundle = self.path("failed", scan_id)
+        lock = self.lock(scan_id)
+        if lock is None or not bundle.is_dir():
+            if lock is not None:
+                self.unlock(scan_id, lock)
+            raise SpoolError(
+                f"scan {scan_id} is not among the failed ones in {bundle.parent}; see station list"
+            )
+        try:
+            fresh = ScanNote(scan_id, "accepted", label=self.note(scan_id).label)
+            self.notes.write(fresh, durable=True)
+            (bundle / REASON).unlink(missing_ok=True)
+            os.rename(bundle, self.path("queue", scan_id))
+            fsync_folder(self.folder / "queue")
+        finally:
+            self.unlock(scan_id, lock)
+
+    def recover(self, retries: int) -> list[ScanId]:
         """Put back the scans of workers that died; fail those that were tried too often.
 
-        Also finishes deliveries that a crash cut short. Returns the ids that were put back.
+        Also finishes deliveries that a crash cut short. Returns the ids that were put back. A scan
+        that the disk does not let be moved is left for the next call.
         """
         back = []
-        for entry in sorted((self.folder / "work").iterdir()):
-            scan_id = entry.name
-            lock = self._lock(scan_id)
-            if lock is None:
-                continue
-            claim = Claim(self, scan_id, lock, self._tries(scan_id))
-            if self.path("outbox", scan_id).exists():
-                claim.finish("done")
-            elif claim.tries > retries:
-                claim.fail(f"the worker died {claim.tries} times on this scan")
-            else:
-                claim.put_back()
-                back.append(scan_id)
+        for scan_id in self._scans_in("work"):
+            try:
+                lock = self.lock(scan_id)
+                if lock is None:
+                    continue
+                claim = Claim(self, scan_id, lock, self.note(scan_id))
+                try:
+                    if self._settle(claim, retries):
+                        back.append(scan_id)
+                finally:
+                    claim.close()
+            except OSError as error:
+                _LOG.warning("scan %s waits for the disk: %s", scan_id, error)
         return back
 
+    def _settle(self, claim: Claim, retries: int) -> bool:
+        """End an abandoned claim; True if the scan was put back."""
+        note = claim.note
+        result = self.folder / "tmp" / note.result
+        if note.stage == "delivered" or self.path("outbox", claim.scan_id).exists():
+            claim.delivered()
+        elif note.stage == "delivering" and note.boot == boot_id():
+            if result.is_dir():
+                claim.deliver(result, note.verdict, note.reason)
+            else:
+                # It got its name before the crash, and was taken from the outbox since.
+                claim.delivered()
+        elif note.tries > retries:
+            claim.fail(f"{note.tries} reconstructions ended badly; the last one: {note.reason}")
+        elif note.deaths >= MOST_DEATHS:
+            claim.fail(f"the station ended {note.deaths + 1} times while it worked on this scan")
+        else:
+            if claim.scan_id not in self.released:
+                claim.count_death()
+            claim.put_back()
+            self.released.discard(claim.scan_id)
+            return True
+        return False
+
     def sweep(self) -> None:
-        """Remove what crashed writers left behind."""
+        """Remove what dead writers left behind; what a delivery still needs stays."""
+        needed = {note.result for scan_id in self._scans_in("work") if (note := self.note(scan_id))}
         for entry in (self.folder / "tmp").iterdir():
-            if time.time() - entry.stat().st_mtime > _LEFTOVER_AGE_S:
+            if entry.name not in needed and not _writer_lives(entry.name):
                 shutil.rmtree(entry, ignore_errors=True)
 
     def every(self) -> Iterator[tuple[str, Path]]:
@@ -158,67 +257,115 @@ class Spool:
             for entry in sorted((self.folder / state).iterdir()):
                 yield state, entry
 
-    def _lock(self, scan_id: str) -> int | None:
+    def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""
         path = self.folder / "locks" / f"{scan_id}.lock"
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        while True:
+            descriptor = os.open(path, flags, 0o600)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Whoever had it before removes the file: a lock on a removed one locks nothing.
+                if os.stat(path).st_ino == os.fstat(descriptor).st_ino:
+                    return descriptor
+            except BlockingIOError:
+                os.close(descriptor)
+                return None
+            except FileNotFoundError:
+                pass
+            except OSError:
+                os.close(descriptor)
+                raise
             os.close(descriptor)
-            return None
-        return descriptor
 
-    def _tries_path(self, scan_id: str) -> Path:
-        return self.folder / "locks" / f"{scan_id}.tries.json"
-
-    def _tries(self, scan_id: str) -> int:
-        try:
-            return int(json.loads(self._tries_path(scan_id).read_text())["tries"])
-        except (OSError, ValueError, KeyError):
-            return 0
-
-    def _count_try(self, scan_id: str) -> int:
-        tries = self._tries(scan_id) + 1
-        write_json(self._tries_path(scan_id), {"tries": tries})
-        return tries
+    def unlock(self, scan_id: ScanId, lock: int) -> None:
+        """Free a scan's lock; its file goes, so that no name outlives its scan."""
+        with contextlib.suppress(OSError):
+            (self.folder / "locks" / f"{scan_id}.lock").unlink()
+        os.close(lock)
 
 
-@dataclass(frozen=True, slots=True)
+def _writer_lives(name: str) -> bool:
+    """Whether the process that made a temporary name (`name.<pid>.<ns>`) still runs."""
+    parts = name.split(".")
+    return len(parts) > 2 and parts[-2].isdigit() and Path(f"/proc/{parts[-2]}").exists()
+
+
 class Claim:
     """A scan that this process, and no other, works on."""
 
-    spool: Spool
-    scan_id: str
-    lock: int
-    tries: int
+    def __init__(self, spool: Spool, scan_id: ScanId, lock: int, note: ScanNote) -> None:
+        self.spool, self.scan_id, self.note = spool, scan_id, note
+        self._lock: int | None = lock
 
     @property
     def bundle(self) -> Path:
         return self.spool.path("work", self.scan_id)
 
-    def deliver(self, result: Path) -> None:
-        """Publish a result exactly once, then put the bundle away."""
+    @property
+    def tries(self) -> int:
+        """Reconstructions that ended badly so far."""
+        return self.note.tries
+
+    def deliver(self, result: Path, verdict: str = "ok", reason: str = "") -> None:
+        """Publish a result exactly once, then put the bundle away.
+
+        Args:
+            result: a finished folder under the spool's `tmp/`.
+            verdict, reason: what it says: "ok", or "rescan" and why.
+
+        Raises:
+            OSError: the disk refused; release the claim, and `Spool.recover` goes on from here.
+        """
         final = self.spool.path("outbox", self.scan_id)
         if final.exists():
             shutil.rmtree(result, ignore_errors=True)
         else:
+            self._write("delivering", result=result.name, verdict=verdict, reason=reason)
             publish_folder(result, final)
-        self.finish("done")
+        self.delivered()
+
+    def delivered(self) -> None:
+        """Put the bundle of a delivered scan away."""
+        self._write("delivered", result="")
+        self._move("done")
+
+    def count_try(self, reason: str) -> None:
+        """Note a reconstruction that ended badly by itself."""
+        self.note = replace(self.note, tries=self.note.tries + 1, reason=reason)
+        self.spool.notes.write(self.note, durable=False)
+
+    def count_death(self) -> None:
+        """Note that the worker's process ended while it worked on this scan."""
+        self.note = replace(self.note, deaths=self.note.deaths + 1)
+        self.spool.notes.write(self.note, durable=False)
 
     def fail(self, reason: str) -> None:
         """Give up: the bundle is kept in failed/ with the reason."""
-        write_json(self.bundle / REASON, {"reason": reason, "tries": self.tries})
-        self.finish("failed")
+        write_json(self.bundle / REASON, {"reason": reason, "tries": self.note.tries})
+        self._write("failed", reason=reason, result="")
+        self._move("failed")
 
     def put_back(self) -> None:
         """Let anybody try again."""
         self._move("queue")
 
-    def finish(self, state: str) -> None:
-        """Put the bundle away and forget its tries."""
-        self._move(state)
-        self.spool._tries_path(self.scan_id).unlink(missing_ok=True)
+    def close(self) -> None:
+        """Drop the lock, if it is still held."""
+        if self._lock is not None:
+            self.spool.unlock(self.scan_id, self._lock)
+            self._lock = None
+
+    def release(self) -> None:
+        """Give the claim up where it is; `Spool.recover` looks after the scan."""
+        if self._lock is not None:
+            self.spool.released.add(self.scan_id)
+            self.close()
+
+    def _write(self, stage: Stage, **changes: str) -> None:
+        changed: Callable[..., ScanNote] = replace
+        self.note = changed(self.note, stage=stage, boot=boot_id(), **changes)
+        self.spool.notes.write(self.note, durable=True)
 
     def _move(self, state: str) -> None:
         target = self.spool.path(state, self.scan_id)
@@ -226,4 +373,12 @@ class Claim:
             shutil.rmtree(target)
         os.rename(self.bundle, target)
         fsync_folder(target.parent)
-        os.close(self.lock)
+        self.close()
+
+
+def failure_reason(folder: Path) -> str:
+    """Why the bundle in a folder of failed/ was given up."""
+    try:
+        return str(read_small(folder / REASON, 1 << 16)["reason"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "unknown; see the workers' log"

@@ -7,11 +7,26 @@ with words; nothing is ever unpickled.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields
+from math import isfinite
 from typing import Any, ClassVar, Self
 
 import msgpack
 
 from station.core.errors import FormatError
+
+_MOST_PIXELS = 4096
+"""On a side of a depth image; no depth sensor has more."""
+_MOST_TEXT = 10_000
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "str": str,
+    "int": int,
+    "float": (float, int),
+    "bool": bool,
+    "list[float]": list,
+    "list[list[float]]": list,
+    "dict[str, Any]": dict,
+}
+"""What msgpack may give for a field; annotations are strings here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,27 +45,51 @@ class Message:
         """The message of packed bytes.
 
         Raises:
-            FormatError: it is torn, of another type or of another version.
+            FormatError: it is torn, of another type or version, or a value is impossible.
         """
         try:
             content = msgpack.unpackb(data)
-        except (ValueError, msgpack.UnpackException) as cause:
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as cause:
             raise FormatError(f"a message is torn ({cause})") from None
         if not isinstance(content, dict) or content.get("type") != cls.__name__:
             found = content.get("type") if isinstance(content, dict) else type(content).__name__
-            raise FormatError(f"a {cls.__name__} message was expected, {found!r} came")
-        if content.get("version") != cls.VERSION:
+            raise FormatError(f"a {cls.__name__} message was expected, {found!a:.80} came")
+        version = content.get("version")
+        if version != cls.VERSION or isinstance(version, bool):
             raise FormatError(
-                f"{cls.__name__} has version {content.get('version')!r}, this program speaks "
+                f"{cls.__name__} has version {version!a:.80}, this program speaks "
                 f"{cls.VERSION}; run the same release everywhere"
             )
-        known = {item.name for item in fields(cls)}
         values = {key: value for key, value in content.items() if key not in ("type", "version")}
-        if set(values) != known:
-            raise FormatError(
-                f"{cls.__name__} has the fields {sorted(values)}, not {sorted(known)}"
-            )
-        return cls(**values)
+        known = {item.name: str(item.type) for item in fields(cls)}
+        if values.keys() != known.keys():
+            names = ", ".join(sorted(f"{key!a:.80}" for key in values))
+            raise FormatError(f"{cls.__name__} has the fields {names:.400}, not {sorted(known)}")
+        for name, kind in known.items():
+            if not _is(values[name], kind):
+                raise FormatError(f"{cls.__name__}: {name} is {values[name]!a:.80}, not {kind}")
+        message = cls(**values)
+        if (problem := message.impossible()) is not None:
+            raise FormatError(f"{cls.__name__}: {problem}")
+        return message
+
+    def impossible(self) -> str | None:
+        """Which value cannot be, beyond its type; None if all can."""
+        return None
+
+
+def _is(value: object, kind: str) -> bool:
+    if isinstance(value, bool) != (kind == "bool") or not isinstance(value, _KINDS[kind]):
+        return False
+    if kind == "float":
+        return isinstance(value, int | float) and isfinite(value)
+    if isinstance(value, str):
+        return len(value) <= _MOST_TEXT
+    if kind == "list[float]":
+        return isinstance(value, list) and all(_is(item, "float") for item in value)
+    if kind == "list[list[float]]":
+        return isinstance(value, list) and all(_is(item, "list[float]") for item in value)
+    return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +106,26 @@ class FrameHeader(Message):
     device_ticks: int
     tick_hz: float
     host_time_s: float
-    """Time at which it was taken: the host's monotonic clock, by the clock model."""
+    """When it was taken, host's monotonic clock, by the clock model."""
     received_s: float
-    """Time at which it reached the host, same clock."""
+    """When it reached the host, same clock."""
     sequence: int
     clock_resets: int
-    """Resets of the sensor's clock so far: times before and after one have nothing in common."""
+    """How often the sensor's clock was reset: times before and after have nothing in common."""
+
+    def impossible(self) -> str | None:
+        if not (0 < self.width <= _MOST_PIXELS and 0 < self.height <= _MOST_PIXELS):
+            return f"an image of {self.width} x {self.height}"
+        if not (0.0 < self.depth_scale_m < 0.1 and self.tick_hz > 0.0):
+            return f"depth_scale_m {self.depth_scale_m}, tick_hz {self.tick_hz}"
+        if min(self.device_ticks, self.sequence, self.clock_resets) < 0:
+            return "a negative count"
+        return None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth(Message):
-    """The state of a sensor, sent by its capture process twice a second."""
+    """What a capture process says of its sensor, twice a second."""
 
     camera: str
     state: str
@@ -117,10 +165,14 @@ class DesiredState(Message):
 class Request(Message):
     """A command to control or sync; the same scan id twice is the same scan."""
 
+    VERSION: ClassVar[int] = 2
+
     command: str
     """"start", "stop", "scan", "cancel", "scan-status" or "status"."""
     scan_id: str = ""
     label: str = ""
+    valid_until_s: float = 0.0
+    """A scan that is taken up later is void; host's monotonic clock. 0: control sets it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +186,11 @@ class Reply(Message):
 
 @dataclass(frozen=True, slots=True)
 class ScanEvent(Message):
-    """Progress of a scan that sync collects."""
+    """How far a scan is. The verdict is on disk too; who missed it here asks control."""
 
     scan_id: str
     state: str
-    """"capturing", "accepted" or "failed"."""
+    """"capturing", "writing", "accepted" or "failed"."""
     framesets: int
     wanted: int
-    reason: str
+    reason: str = ""

@@ -1,4 +1,8 @@
-"""Every topic that is published: who sends it, how often, how much may wait, what a loss means."""
+"""Every topic that is published. Sockets, silence limits and health follow from this table.
+
+Nothing here is relied upon: scans are on disk, commands have replies, and a lost message is counted
+where it matters (frames have sequence numbers).
+"""
 
 from __future__ import annotations
 
@@ -9,21 +13,19 @@ from dataclasses import dataclass
 class Topic:
     """One kind of published message."""
 
-    message: str
     rate_hz: float
+    """How often its sender publishes it."""
     max_age_s: float
-    """Older ones say that the sender is gone."""
+    """Without a new one for so long, its sender is named as silent."""
     high_water_mark: int
-    lossy: bool
-    """A loss is counted and harmless."""
+    """How many wait for a slow reader; more are lost."""
 
 
 TOPICS = {
-    "depth": Topic("FrameHeader", 30.0, 1.0, 8, lossy=True),
-    "health": Topic("CameraHealth", 2.0, 2.0, 8, lossy=True),
-    "sensor": Topic("SensorInfo", 2.0, 2.0, 8, lossy=True),
-    "desired": Topic("DesiredState", 4.0, 2.0, 2, lossy=True),
-    "scan": Topic("ScanEvent", 10.0, 1.0, 100, lossy=True),
-    "cloud": Topic("points", 3.0, 2.0, 1, lossy=True),
+    "depth": Topic(30.0, 1.0, 8),
+    "health": Topic(2.0, 2.0, 8),
+    "sensor": Topic(2.0, 2.0, 8),
+    "desired": Topic(4.0, 2.0, 2),
+    "scan": Topic(10.0, 1.0, 100),
+    "cloud": Topic(3.0, 2.0, 1),
 }
-"""Nothing here is relied upon: scans are on disk, commands have replies."""

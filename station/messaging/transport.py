@@ -10,13 +10,19 @@ from pathlib import Path
 import zmq
 
 from station.core.errors import BoothError
-from station.core.files import private_folder
+from station.core.files import is_held, private_folder
 from station.messaging.messages import Reply, Request
 from station.messaging.topics import TOPICS
 
 _LONGEST_PATH = 100
 """The kernel allows 107 bytes for a socket's path."""
 MAX_MESSAGE_BYTES = 16 << 20
+STATION_LOCK = "station.lock"
+"""Held by `station run` in the runtime folder."""
+
+
+class NoAnswerError(BoothError):
+    """A process did not answer in time: what was asked may be done all the same."""
 
 
 def endpoint(runtime_folder: Path, name: str) -> str:
@@ -58,6 +64,15 @@ def server(
     return _bound(context, zmq.ROUTER, runtime_folder, name, 64)
 
 
+def dealer(
+    context: zmq.Context[zmq.Socket[bytes]], runtime_folder: Path, name: str
+) -> zmq.Socket[bytes]:
+    """A socket that sends requests to a server without waiting for the answers."""
+    socket = _socket(context, zmq.DEALER, 64)
+    socket.connect(endpoint(runtime_folder, name))
+    return socket
+
+
 def _bound(
     context: zmq.Context[zmq.Socket[bytes]], kind: int, runtime_folder: Path, name: str, hwm: int
 ) -> zmq.Socket[bytes]:
@@ -91,7 +106,7 @@ def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> 
     """Send a request and wait for its reply.
 
     Raises:
-        BoothError: nobody answered in time.
+        NoAnswerError: nobody answered in time.
     """
     with zmq.Context() as context, _socket(context, zmq.REQ, 4) as socket:
         socket.set(zmq.RCVTIMEO, int(1000 * timeout_s))
@@ -100,7 +115,11 @@ def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> 
             socket.send(request.pack())
             return Reply.unpack(socket.recv())
         except zmq.Again:
-            raise BoothError(
-                f"the station's {name} process does not answer within {timeout_s:g} s; "
-                "is it running? start it with: station run"
+            remedy = (
+                "it is started again when it hangs; ask again in 15 s"
+                if any(is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock"))
+                else "is it running? start it with: station run"
+            )
+            raise NoAnswerError(
+                f"the station's {name} process does not answer within {timeout_s:g} s; {remedy}"
             ) from None

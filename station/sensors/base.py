@@ -18,6 +18,7 @@ class DeviceInfo:
     """A sensor as it was opened."""
 
     serial: str
+    """What the sensor says of itself; a recording has a name with a colon instead."""
     model: str
     width: int
     height: int
@@ -33,6 +34,11 @@ class DeviceInfo:
     """The device clock wraps after 2 ** tick_bits ticks."""
 
 
+def is_serial(text: str) -> bool:
+    """Whether a serial number tells one device from others; a recording's name does not."""
+    return bool(text) and ":" not in text
+
+
 @dataclass(frozen=True, slots=True)
 class DepthFrame:
     """One depth image as the sensor gave it."""
@@ -40,8 +46,8 @@ class DepthFrame:
     depth: NDArray[np.uint16]
     """(height, width) in units of ``DeviceInfo.depth_scale_m``; 0 = no reading."""
     device_ticks: int
-    host_time_s: float
-    """Monotonic host time at which the frame was received."""
+    received_s: float
+    """When it reached the host, host's monotonic clock."""
     sequence: int
     """Counts the frames that the sensor delivered; a gap is a loss."""
 

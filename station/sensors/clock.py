@@ -35,6 +35,21 @@ class DeviceClock:
     _envelope: deque[tuple[float, float]] = field(default_factory=deque)
     """(device seconds, least delay) of each bucket."""
 
+    @property
+    def offset_s(self) -> float | None:
+        """Host's time minus the device's, by the model, at the last frame; None before any."""
+        if not self._envelope:
+            return None
+        return self._offset_at(self._epoch_ticks / self.tick_hz)
+
+    @property
+    def drift(self) -> float | None:
+        """How much faster the host's clock runs, a share; None within the first seconds."""
+        if len(self._envelope) < 2:
+            return None
+        (x0, y0), (x1, y1) = self._envelope[0], self._envelope[-1]
+        return (y1 - y0) / (x1 - x0) if x1 - x0 > _LEAST_SPAN_S else None
+
     def host_time_s(self, ticks: int, arrival_s: float) -> float:
         """Time at which a frame was taken, on the host's monotonic clock, in seconds.
 

@@ -5,12 +5,17 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from station.booth.retention import FILE, Moment, expire_old, purge_scan
+from station.core.config import RetentionConfig
+from station.core.scans import ScanId, ScanNote
 from station.core.spool import REASON, Spool
 
+_DAY_S = 86_400.0
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
 
 
@@ -60,14 +65,52 @@ def test_a_bad_bundle_fails_once_with_its_reason(
 
 
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
-    from station.booth.retention import expire_old
-    from station.core.config import RetentionConfig
-
     for state in ("done", "outbox", "queue"):
         spool.path(state, "a").mkdir()
-    day_s = 86_400.0
-    removed = expire_old(spool, RetentionConfig(raw_days=2, result_days=9), time.time() + 3 * day_s)
-    assert removed == [spool.path("done", "a")]
-    removed = expire_old(spool, RetentionConfig(), time.time() + 99 * day_s)
-    assert removed == [spool.path("outbox", "a")]
+    retention = RetentionConfig(raw_days=2, result_days=9)
+    start = Moment(1.8e9, 100.0, "boot")
+    assert expire_old(spool, retention, start) == []
+    later = replace(start, since_boot_s=100.0 + 3 * _DAY_S)
+    assert expire_old(spool, retention, later) == [spool.path("done", "a")]
+    later = replace(start, since_boot_s=100.0 + 10 * _DAY_S)
+    assert expire_old(spool, retention, later) == [spool.path("outbox", "a")]
     assert spool.path("queue", "a").exists()
+
+
+@pytest.mark.parametrize("jump_days", [40.0, -40.0, -20000.0])
+def test_a_wall_clock_that_jumps_deletes_nothing(spool: Spool, jump_days: float) -> None:
+    """A clock 40 days ahead, or a dead battery, deleted what had been scanned that day."""
+    for state in ("done", "outbox"):
+        spool.path(state, "a").mkdir()
+    start = Moment(1.8e9, 100.0, "boot")
+    jumped = 1.8e9 + jump_days * _DAY_S
+    for moment in (
+        start,
+        Moment(jumped, 200.0, "boot"),
+        Moment(jumped, 50.0, "another boot"),
+        Moment(1.8e9, 60.0, "a third one"),
+    ):
+        assert expire_old(spool, RetentionConfig(raw_days=5), moment) == []
+
+
+def test_a_station_that_was_off_for_the_night_counts_it(spool: Spool) -> None:
+    spool.path("done", "a").mkdir()
+    for day in range(4):
+        moment = Moment(1.8e9 + day * _DAY_S, 3600.0, f"boot {day}")
+        removed = expire_old(spool, RetentionConfig(raw_days=2.5), moment)
+    assert removed == [spool.path("done", "a")]
+
+
+def test_nothing_of_a_purged_scan_stays(spool: Spool) -> None:
+    scan_id = ScanId("20260101T000000Z-0001")
+    for state in ("done", "outbox", "debug"):
+        (spool.folder / state / scan_id).mkdir(parents=True)
+    (spool.folder / "tmp" / f"{scan_id}.99.1").mkdir()
+    (spool.folder / "tmp" / f"{scan_id}.99.1/000.png").write_bytes(b"a body")
+    (spool.folder / "tmp" / f"{scan_id}5.99.1").mkdir()
+    spool.notes.write(ScanNote(scan_id, "delivered", label="Order 1"), durable=True)
+    expire_old(spool, RetentionConfig())
+    purge_scan(spool, scan_id)
+    left = [path for path in spool.folder.rglob("*") if scan_id in path.name]
+    assert [path.name for path in left] == [f"{scan_id}5.99.1"]
+    assert scan_id not in (spool.folder / FILE).read_text()

@@ -1,4 +1,3 @@
-import json
 import multiprocessing
 import os
 import signal
@@ -8,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from station.core.errors import SpoolError
-from station.core.spool import REASON, Spool
+from station.core.scans import ScanId
+from station.core.spool import MOST_DEATHS, Spool, failure_reason
 
 
 def _submit(spool: Spool, scan_id: str) -> None:
@@ -70,27 +70,129 @@ def _kill_a_worker(folder: Path, step: str) -> None:
     worker.join()
 
 
-def test_a_killed_worker_costs_a_try_and_no_scan(tmp_path: Path) -> None:
-    spool = Spool(tmp_path)
-    _submit(spool, "a")
-    _kill_a_worker(tmp_path, "claimed")
-    assert spool.recover(retries=2) == ["a"]
-    claim = spool.claim()
-    assert claim is not None
-    assert claim.tries == 2
-    claim.deliver(_result(spool, "a"))
-    assert spool.recover(retries=2) == []
-
-
-def test_a_poisoned_scan_ends_in_failed_with_its_reason(tmp_path: Path) -> None:
+def test_a_killed_worker_costs_neither_a_try_nor_the_scan(tmp_path: Path) -> None:
+    """Three restarts of the station used to end in "failed", however sound the scan was."""
     spool = Spool(tmp_path)
     _submit(spool, "a")
     for _ in range(2):
         _kill_a_worker(tmp_path, "claimed")
-        spool.recover(retries=1)
+        assert spool.recover(retries=0) == ["a"]
+    claim = spool.claim()
+    assert claim is not None
+    assert (claim.tries, claim.note.deaths) == (0, 2)
+    claim.deliver(_result(spool, "a"))
+    assert spool.recover(retries=2) == []
+
+
+def test_a_scan_that_ends_every_worker_is_given_up(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    for _ in range(MOST_DEATHS):
+        claim = spool.claim()
+        assert claim is not None
+        claim.close()
+        assert spool.recover(retries=2) == ["a"]
+    claim = spool.claim()
+    assert claim is not None
+    claim.close()
+    assert spool.recover(retries=2) == []
     assert spool.where("a") == "failed"
-    reason = json.loads((spool.path("failed", "a") / REASON).read_text())
-    assert "died 2 times" in reason["reason"]
+    assert "the station ended" in failure_reason(spool.path("failed", "a"))
+
+
+def test_a_scan_whose_jobs_crash_is_given_up_with_the_last_reason(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    claim.count_try("the job ended unexpectedly, by SIGSEGV")
+    claim.close()
+    assert spool.recover(retries=0) == []
+    assert "by SIGSEGV" in failure_reason(spool.path("failed", "a"))
+    spool.retry(ScanId("a"))
+    again = spool.claim()
+    assert again is not None
+    assert again.tries == 0
+    with pytest.raises(SpoolError, match="not among the failed"):
+        spool.retry(ScanId("a"))
+
+
+def test_a_result_that_was_moved_away_is_not_delivered_again(tmp_path: Path) -> None:
+    """A pool killed between the result's new name and putting the bundle away did it twice."""
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    result = _result(spool, "a")
+    claim._write("delivering", result=result.name, verdict="ok", reason="")
+    result.rename(tmp_path / "fitting-room")
+    claim.close()
+    assert spool.recover(retries=2) == []
+    assert spool.where("a") is None
+    assert spool.path("done", "a").exists()
+    _submit(spool, "a")
+    assert spool.waiting() == []
+
+
+def test_a_delivery_that_was_cut_short_is_finished_without_another_fit(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    claim._write("delivering", result=_result(spool, "a").name, verdict="rescan", reason="moved")
+    claim.close()
+    spool.sweep()
+    assert spool.recover(retries=2) == []
+    assert spool.where("a") == "outbox"
+    note = spool.notes.read(ScanId("a"))
+    assert note is not None
+    assert (note.stage, note.verdict, note.reason) == ("delivered", "rescan", "moved")
+
+
+def test_no_name_of_a_delivered_scan_stays_in_the_locks(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    claim.deliver(_result(spool, "a"))
+    assert not list((tmp_path / "locks").iterdir())
+
+
+@pytest.mark.parametrize("name", ["x" * 231, "../escape", "a b", "", "ä", "a\n"])
+def test_only_a_scan_id_is_accepted(tmp_path: Path, name: str) -> None:
+    """An id of 231 letters stopped all workers after each restart: its lock had too long a name."""
+    spool = Spool(tmp_path / "spool")
+    folder = tmp_path / "spool/tmp/x"
+    folder.mkdir()
+    with pytest.raises(SpoolError, match="no scan id"):
+        spool.submit(folder, name)
+
+
+def test_what_is_no_bundle_in_the_queue_stops_nobody(tmp_path: Path) -> None:
+    spool = Spool(tmp_path)
+    (tmp_path / "queue" / ("0" * 231)).mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "queue/0-link").symlink_to(tmp_path / "elsewhere")
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    assert claim.scan_id == "a"
+
+
+def test_the_same_scan_in_queue_and_work_is_one(tmp_path: Path) -> None:
+    """Their rename failed for ever, and the worker's thread died of it."""
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    claim.close()
+    (tmp_path / "queue/a").mkdir()
+    (tmp_path / "queue/a/bundle.json").write_text("{}")
+    assert spool.claim() is None
+    assert spool.recover(retries=2) == ["a"]
+    again = spool.claim()
+    assert again is not None
+    assert spool.waiting() == []
 
 
 def test_a_crash_after_delivery_delivers_once(tmp_path: Path) -> None:

@@ -1,21 +1,27 @@
-"""Process that warms up, does one job and ends, so that nothing it holds or leaks outlives the job.
+"""A process that warms up, does one job and ends: what it holds or leaks ends with it.
 
 Speaks JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method", "volume"}, reports
-{"step", "share"} and ends with {"status", "reasons"} or {"error"}.
+{"step", "share"} and ends with {"status", "reasons"}, {"error"} (the scan cannot be used), {"disk"}
+(the disk refused, the scan is innocent) or {"died"}. Its first argument is the process to end with.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
 from station.core.config import Volume
 from station.core.errors import BoothError
-from station.core.service import die_with_parent
+from station.core.service import die_with_parent, set_up_caches
+
+MEMORY_BYTES = 2 << 30
+"""What a job may allocate; a usual one takes a third of it."""
 
 
 def _say(channel: int, message: dict[str, Any]) -> None:
@@ -23,14 +29,17 @@ def _say(channel: int, message: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    die_with_parent()
-    # Ctrl-C on a terminal reaches the whole group; the pool decides when this process ends.
+    if len(sys.argv) > 1:
+        die_with_parent(int(sys.argv[1]))
+    set_up_caches()
+    # Ctrl-C on a terminal reaches the whole group; when to end is the pool's to say.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Libraries print to stdout; only this process may write to the pipe to the pool.
+    # Libraries print to stdout; the pipe to the pool must hear this process alone.
     channel = os.dup(1)
     os.dup2(2, 1)
     from workers.reconstruct.job import reconstruct_bundle, warm_up
 
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
     model = warm_up()
     _say(channel, {"ready": True})
     line = sys.stdin.readline()
@@ -48,6 +57,16 @@ def main() -> None:
         )
     except BoothError as error:
         _say(channel, {"error": str(error)})
+        return
+    except OSError as error:
+        _say(channel, {"disk": str(error)})
+        return
+    except MemoryError:
+        _say(channel, {"died": f"the job needed more than {MEMORY_BYTES >> 20} MB of memory"})
+        return
+    except Exception as error:
+        traceback.print_exc()
+        _say(channel, {"died": f"the job ended unexpectedly ({type(error).__name__}: {error})"})
         return
     _say(channel, {"status": summary.status, "reasons": list(summary.reasons)})
 

@@ -1,156 +1,177 @@
 """Reconstruction workers: claim a scan, run it in a process of its own, deliver.
 
-Input that cannot be used fails at once with its reason; a crash or a hang is tried again. The next
-job's process warms up while the current one works.
+Input that cannot be used fails at once with its reason; a job that crashes or hangs is tried again,
+so many times; an end that is none of the job's doing (the station stopped, the disk refused) costs
+no try. The next job's process warms up while the current one works. Nothing that a disk does ends a
+worker: it goes on when the disk does.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-import selectors
 import shutil
-import subprocess
-import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import click
 
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.files import private_folder
-from station.core.service import notify, set_up_logs, stop_event
-from station.core.spool import Claim, Spool
+from station.core.scans import ScanId
+from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.spool import MOST_DEATHS, Claim, Spool
+from workers.reconstruct.order import JobProcess, Outcome
 
 _POLL_S = 0.05
+_ROUND_S = 0.25
 _RECOVERY_PERIOD_S = 2.0
+_DISK_PAUSE_S = 1.0
+_SLACK_S = 60.0
+"""Beyond a job's time limit, before a worker counts as hanging."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The end of a job's process."""
+class Worker:
+    """One thread that works the queue off."""
 
-    delivered: bool
-    final: bool
-    """Whether another try would end in the same way."""
-    reason: str
+    def __init__(
+        self, config: BoothConfig, spool: Spool, stop: threading.Event, log: logging.Logger
+    ) -> None:
+        self._config, self._spool, self._stop, self._log = config, spool, stop, log
+        self._spare: JobProcess | None = None
+        self.scan_id: ScanId | None = None
+        self.problem = ""
+        self.delivered = self.failed = 0
+        self.progress_s = time.monotonic()
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
 
-
-class JobProcess:
-    """One warmed-up process for one job."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "workers.reconstruct.job_process"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-
-    def run(self, bundle: Path, out: Path, config: BoothConfig) -> Outcome:
-        """Send the job and wait for its end; a job that takes too long is killed."""
-        process = self._process
-        assert process.stdin is not None
-        order = {
-            "bundle": str(bundle),
-            "out": str(out),
-            "method": config.workers.method,
-            "volume": config.volume.model_dump(),
-        }
-        timeout_s = config.workers.timeout_s
+    def _run(self) -> None:
         try:
-            process.stdin.write((json.dumps(order) + "\n").encode())
-            process.stdin.close()
-        except BrokenPipeError:
-            return Outcome(False, False, "the worker process died before it began")
-        last = self._last_message(time.monotonic() + timeout_s)
-        if last is None:
-            self.kill()
-            return Outcome(False, False, f"the job hung for {timeout_s:g} s")
-        process.wait()
-        if "error" in last:
-            return Outcome(False, True, str(last["error"]))
-        if "status" not in last or process.returncode != 0:
-            return Outcome(False, False, f"the worker process died (code {process.returncode})")
-        return Outcome(True, True, "")
+            while not self._stop.is_set():
+                self.progress_s = time.monotonic()
+                try:
+                    worked = self._round()
+                    self.problem = ""
+                except OSError as error:
+                    self._trouble(f"the disk refuses ({error})")
+                    continue
+                except Exception as error:
+                    self._log.exception("a worker goes on after an unexpected error")
+                    self._trouble(f"{type(error).__name__}: {error}")
+                    continue
+                if not worked:
+                    self._stop.wait(_POLL_S)
+        finally:
+            if self._spare is not None:
+                self._spare.kill()
 
-    def _last_message(self, deadline_s: float) -> dict[str, object] | None:
-        """Last message of the process before it ends; None at the deadline."""
-        stdout = self._process.stdout
-        assert stdout is not None
-        last: dict[str, object] = {}
-        pending = b""
-        with selectors.DefaultSelector() as selector:
-            selector.register(stdout, selectors.EVENT_READ)
-            while True:
-                if not selector.select(max(0.0, deadline_s - time.monotonic())):
-                    return None
-                piece = stdout.read1(65536)  # type: ignore[attr-defined]  # a BufferedReader
-                if not piece:
-                    return last
-                *lines, pending = (pending + piece).split(b"\n")
-                for line in lines:
-                    last = json.loads(line)
+    def _trouble(self, problem: str) -> None:
+        if problem != self.problem:
+            self._log.warning("%s; trying again", problem)
+        self.problem = problem
+        self._stop.wait(_DISK_PAUSE_S)
 
-    def kill(self) -> None:
-        """Kill the process."""
-        self._process.kill()
-        self._process.wait()
+    def _round(self) -> bool:
+        """Do the next scan; False if none waits."""
+        if self._spare is None:
+            self._spare = JobProcess()
+        claim = self._spool.claim()
+        if claim is None:
+            return False
+        self.scan_id = claim.scan_id
+        process, self._spare = self._spare, None
+        try:
+            self._do(claim, process)
+        except OSError:
+            claim.release()
+            raise
+        finally:
+            self.scan_id = None
+            process.kill()
+            claim.close()
+        return True
+
+    def _do(self, claim: Claim, process: JobProcess) -> None:
+        out = private_folder(self._spool.temporary(claim.scan_id))
+        process.send(claim.bundle, out, self._config)
+        outcome = process.outcome(self._config.workers.timeout_s, self._stop, self._warm_another)
+        if outcome.status:
+            claim.deliver(out, outcome.status, outcome.reason)
+            self.delivered += 1
+            self._log.info("scan %s delivered", claim.scan_id)
+            return
+        shutil.rmtree(out, ignore_errors=True)
+        self._settle(claim, outcome)
+
+    def _warm_another(self) -> None:
+        """The next job's process warms up while this one works."""
+        self._spare = JobProcess()
+
+    def _settle(self, claim: Claim, outcome: Outcome) -> None:
+        """What becomes of a scan without a result."""
+        if outcome.blame == "nobody":
+            claim.put_back()
+            return
+        if outcome.blame == "disk":
+            claim.put_back()
+            raise OSError(outcome.reason)
+        if outcome.blame == "station":
+            claim.count_death()
+            given_up = claim.note.deaths > MOST_DEATHS
+        else:
+            claim.count_try(outcome.reason)
+            given_up = claim.tries > self._config.workers.retries
+        if given_up or outcome.blame == "scan":
+            claim.fail(outcome.reason)
+            self.failed += 1
+            self._log.error("scan %s failed: %s", claim.scan_id, outcome.reason)
+        else:
+            claim.put_back()
+            self._log.warning("scan %s is tried again: %s", claim.scan_id, outcome.reason)
 
 
 def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> None:
     """Run the configured number of workers until told to stop."""
     spool = Spool(config.spool.folder)
-    workers = [
-        threading.Thread(target=_work, args=(config, spool, stop, log), name=f"worker {index}")
-        for index in range(config.workers.count)
-    ]
-    for worker in workers:
-        worker.start()
-    notify("READY=1")
+    heart = Heartbeat(config.runtime.folder, "workers")
+    workers = [Worker(config, spool, stop, log) for _ in range(config.workers.count)]
+    heart.ready()
+    recovered_s, problem = -_RECOVERY_PERIOD_S, ""
     while not stop.is_set():
-        for scan_id in spool.recover(config.workers.retries):
-            log.warning("scan %s is tried again: its worker died", scan_id)
-        notify("WATCHDOG=1")
-        stop.wait(_RECOVERY_PERIOD_S)
+        now_s = time.monotonic()
+        if now_s - recovered_s >= _RECOVERY_PERIOD_S:
+            recovered_s = now_s
+            problem = _recover(config, spool, log)
+        limit_s = config.workers.timeout_s + _SLACK_S
+        hanging = [w for w in workers if not w.thread.is_alive() or now_s - w.progress_s > limit_s]
+        if not hanging:
+            heart.beat()
+        if heart.due:
+            heart.tell(
+                {
+                    "busy": [w.scan_id for w in workers if w.scan_id],
+                    "threads": sum(w.thread.is_alive() for w in workers),
+                    "delivered": sum(w.delivered for w in workers),
+                    "failed": sum(w.failed for w in workers),
+                    "problems": sorted(
+                        {f"workers: {p}" for p in (problem, *(w.problem for w in workers)) if p}
+                    ),
+                }
+            )
+        stop.wait(_ROUND_S)
     for worker in workers:
-        worker.join()
+        worker.thread.join()
 
 
-def _work(config: BoothConfig, spool: Spool, stop: threading.Event, log: logging.Logger) -> None:
-    spare = JobProcess()
+def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
+    """Look after scans whose worker died; returns what hinders it."""
     try:
-        while not stop.is_set():
-            claim = spool.claim()
-            if claim is None:
-                stop.wait(_POLL_S)
-                continue
-            process, spare = spare, JobProcess()
-            try:
-                _do(config, spool, claim, process, log)
-            finally:
-                process.kill()
-    finally:
-        spare.kill()
-
-
-def _do(
-    config: BoothConfig, spool: Spool, claim: Claim, process: JobProcess, log: logging.Logger
-) -> None:
-    out = private_folder(spool.temporary(claim.scan_id))
-    outcome = process.run(claim.bundle, out, config)
-    if outcome.delivered:
-        claim.deliver(out)
-        log.info("scan %s delivered", claim.scan_id)
-        return
-    shutil.rmtree(out, ignore_errors=True)
-    if outcome.final or claim.tries > config.workers.retries:
-        claim.fail(outcome.reason)
-        log.error("scan %s failed: %s", claim.scan_id, outcome.reason)
-    else:
-        claim.put_back()
-        log.warning("scan %s is tried again: %s", claim.scan_id, outcome.reason)
+        for scan_id in spool.recover(config.workers.retries):
+            log.warning("scan %s is put back: nobody worked on it any more", scan_id)
+    except OSError as error:
+        return f"the spool cannot be looked through ({error}); check its disk"
+    return ""
 
 
 @click.command()

@@ -4,6 +4,7 @@ those of recordings replayed through the very same capture processes."""
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,10 @@ from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
 from station.core.rig import CameraCalibration
 from station.core.service import die_with_parent
-from station.messaging.messages import CameraHealth, DesiredState, FrameHeader, Request, SensorInfo
+from station.messaging.intake import FrameIntake, LiveFrame
+from station.messaging.messages import DesiredState, FrameHeader, Request
 from station.messaging.topics import TOPICS
-from station.messaging.transport import ask, publisher, subscriber
+from station.messaging.transport import ask, publisher
 from station.sensors.base import DeviceInfo
 from station.sensors.clock import DeviceClock
 from station.sensors.recording import check_recording
@@ -107,16 +110,8 @@ class Feed:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         folder = config.runtime.folder
         self._wishes = publisher(self._context, folder, "desired", "desired") if clocks else None
-        self._in = subscriber(
-            self._context,
-            folder,
-            [f"camera-{name}" for name in self._names],
-            ["depth", "health", "sensor"],
-        )
+        self._intake = FrameIntake(self._context, folder, self._names)
         self._wished_s = 0.0
-        self._sensors: dict[str, SensorInfo] = {}
-        self._health: dict[str, CameraHealth] = {}
-        self._seen_s: dict[str, float] = {}
         kept = _REPLAYED_FRAMES if clocks else _LIVE_FRAMES
         self._waiting: deque[TimedFrame] = deque(maxlen=kept)
         self._overrun = 0
@@ -159,7 +154,9 @@ class Feed:
                 raise CalibrationError(answer.error)
         deadline_s = time.monotonic() + timeout_s
         while missing := [
-            name for name in self._names if name not in self._sensors or name not in self._seen_s
+            name
+            for name in self._names
+            if name not in self._intake.sensors or name not in self._intake.last_frame_s
         ]:
             if time.monotonic() > deadline_s:
                 why = "; ".join(f"camera {name} {self._why(name)}" for name in missing)
@@ -180,7 +177,7 @@ class Feed:
                     tick_bits=sensor.tick_bits,
                 ),
             )
-            for name, sensor in ((name, self._sensors[name]) for name in self._names)
+            for name, sensor in ((name, self._intake.sensors[name]) for name in self._names)
         }
 
     def frames(self, timeout_s: float = 0.2) -> list[TimedFrame]:
@@ -192,7 +189,7 @@ class Feed:
         self._receive(timeout_s)
         now_s = time.monotonic()
         limit_s = self._config.sync.silent_after_s
-        for name, seen_s in self._seen_s.items():
+        for name, seen_s in self._intake.last_frame_s.items():
             ended = name in self._clocks and self._clocks[name].over
             if now_s - seen_s > limit_s and not ended:
                 raise CalibrationError(
@@ -213,45 +210,30 @@ class Feed:
         return list({frame.camera: frame for frame in self.frames(timeout_s)}.values())
 
     def _why(self, name: str) -> str:
-        health = self._health.get(name)
-        reason = f" ({health.detail or health.state})" if health else ""
-        return f"gives no frames{reason}"
+        return f"gives no frames{self._intake.why(name)}"
 
     def _receive(self, timeout_s: float) -> None:
         """Take all that has come; wait for the first of it."""
         self._wish()
-        wait_ms = int(1000 * timeout_s)
-        while self._in.poll(wait_ms):
-            wait_ms = 0
-            topic, packed, *body = self._in.recv_multipart(copy=False)
-            kind = bytes(topic.buffer).split(b"/")[0]
-            if kind == b"health":
-                health = CameraHealth.unpack(packed.buffer)
-                self._health[health.camera] = health
-            elif kind == b"sensor":
-                sensor = SensorInfo.unpack(packed.buffer)
-                self._sensors[sensor.camera] = sensor
-            else:
-                header = FrameHeader.unpack(packed.buffer)
-                self._seen_s[header.camera] = time.monotonic()
-                frame = self._timed(header, body[0].buffer)
-                if frame is not None:
-                    self._overrun += len(self._waiting) == self._waiting.maxlen
-                    self._waiting.append(frame)
+        for live in self._intake.frames(timeout_s):
+            frame = self._timed(live)
+            if frame is not None:
+                self._overrun += len(self._waiting) == self._waiting.maxlen
+                self._waiting.append(frame)
 
-    def _timed(self, header: FrameHeader, pixels: memoryview) -> TimedFrame | None:
+    def _timed(self, live: LiveFrame) -> TimedFrame | None:
+        header = live.header
         clock = self._clocks.get(header.camera)
         time_s = header.host_time_s if clock is None else clock.time_s(header)
         if time_s is None:
             return None
-        depth = np.frombuffer(pixels, np.uint16).reshape(header.height, header.width)
         # Replays have the clocks of their recordings, whatever becomes of the replay's.
         resets = header.clock_resets if clock is None else 0
-        return TimedFrame(header.camera, time_s, depth, header.depth_scale_m, resets)
+        return TimedFrame(header.camera, time_s, live.depth, header.depth_scale_m, resets)
 
     def _wish(self) -> None:
         """Capture processes of a replay have no control that tells them to stream."""
-        if self._wishes is None or set(self._health) != set(self._names):
+        if self._wishes is None or set(self._intake.health) != set(self._names):
             return
         now_s = time.monotonic()
         if now_s - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
@@ -317,7 +299,7 @@ def replayed_feed(config: BoothConfig, recordings: Path) -> Iterator[Feed]:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                preexec_fn=die_with_parent,
+                preexec_fn=partial(die_with_parent, os.getpid()),
             )
             for camera in clocks
         ]

@@ -1,0 +1,108 @@
+"""How the booth is, from what its processes wrote of themselves and from the spool.
+
+Needs no process to answer: a hung one is seen by its age. `station status` prints it, control's
+`status` command returns it, and the metrics are made from it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from station.core.config import BoothConfig
+from station.core.service import read_health
+from station.core.spool import STATES, count_scans
+
+MOST_AGE_S = 3.0
+"""A process tells its health four times a second; older says that it hangs or is gone."""
+_STUCK_S = 60.0
+"""Beyond its time limit, a claimed scan that nobody ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoothHealth:
+    """The booth at one moment."""
+
+    processes: dict[str, dict[str, Any]]
+    """What each process said last, with `age_s`; {} of one that said nothing."""
+    sync: dict[str, Any]
+    """Cameras, framesets and latencies; {"error"} while sync gives no word."""
+    spool: dict[str, int]
+    """Scans in each folder."""
+    oldest_waiting_s: float
+    stuck: list[str]
+    """Claimed scans that should have ended."""
+    free_bytes: int
+    problems: list[str] = field(default_factory=list)
+    """What is wrong and what to do, the worst first; empty: all is well."""
+
+
+def process_names(config: BoothConfig) -> list[str]:
+    """The processes that a booth consists of."""
+    names = ["control", "sync", *(f"capture {camera.name}" for camera in config.cameras)]
+    return [*names, "workers"] if config.workers.count else names
+
+
+def booth_health(config: BoothConfig) -> BoothHealth:
+    """The booth as it is now; what cannot be read is a problem of its own."""
+    folder = config.runtime.folder
+    processes = {name: read_health(folder, name) for name in process_names(config)}
+    problems = _silent(processes)
+    sync = processes["sync"]
+    if not sync or sync["age_s"] > MOST_AGE_S:
+        sync = {"error": "the sync process gives no word of cameras and framesets"}
+    for name, camera in sync.get("cameras", {}).items():
+        if camera["trouble"]:
+            problems.append(f"camera {name}: {camera['trouble']}")
+    problems += [str(problem) for problem in processes.get("workers", {}).get("problems", [])]
+    spool, oldest_s, stuck, free = _disk(config, problems)
+    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
+
+
+def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
+    """The processes that say nothing, with what to do."""
+    if not any(processes.values()):
+        return ["no process of the booth runs here; start it: station run"]
+    return [
+        f"the {name} process has said nothing for {content['age_s']:.0f} s; it is started again "
+        "by itself, else: station run"
+        if content
+        else f"the {name} process does not run; is it in the log of station run?"
+        for name, content in processes.items()
+        if not content or content["age_s"] > MOST_AGE_S
+    ]
+
+
+def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], float, list[str], int]:
+    """Counts of scans, age of the oldest waiting one, stuck ones, free bytes."""
+    folder = config.spool.folder
+    if not folder.is_dir():
+        return {}, 0.0, [], 0
+    try:
+        counts = count_scans(folder)
+        now_s = time.time()
+        waiting = [now_s - entry.stat().st_mtime for entry in (folder / "queue").iterdir()]
+        limit_s = config.workers.timeout_s + _STUCK_S
+        stuck = [
+            entry.name
+            for entry in (folder / "work").iterdir()
+            if now_s - entry.stat().st_ctime > limit_s
+        ]
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        problems.append(f"the spool cannot be read ({error}); check its disk")
+        return {}, 0.0, [], 0
+    if free < config.spool.min_free_mb * 1e6:
+        problems.append(
+            f"{folder} has {free / 1e6:.0f} MB free, scans are refused below "
+            f"{config.spool.min_free_mb:.0f} MB; free some space, or: station purge --old"
+        )
+    problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
+    return (
+        {state: counts.get(state, 0) for state in STATES if counts.get(state)},
+        max(waiting, default=0.0),
+        stuck,
+        free,
+    )

@@ -1,0 +1,244 @@
+"""The disk's part of taking a scan: orders noted, bundles written, verdicts given.
+
+Everything here runs in one thread beside the frames: a stalled disk delays a verdict, it loses no
+frame and changes no verdict. Who collects frames hears through `events`.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from typing import TypeVar
+
+from station.booth.collection import LATE, Collection, Order
+from station.calibration.drift.watch import DriftWatch
+from station.core.bundle import CapturedFrame, write_bundle
+from station.core.config import BoothConfig
+from station.core.errors import BoothError, CalibrationError
+from station.core.rig import Rig
+from station.core.scans import ScanId, ScanNote, boot_id
+from station.core.spool import Spool
+
+T = TypeVar("T")
+_DISK_RETRY_S = 0.5
+_ENDED = "the station was interrupted during the scan; scan again"
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """An order is noted: its frames may be collected."""
+
+    order: Order
+    rig: Rig
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A scan has its verdict."""
+
+    scan_id: ScanId
+    accepted: bool
+    reason: str
+
+
+class ScanWriter:
+    """Works orders and collections off, one after the other."""
+
+    def __init__(self, config: BoothConfig, drift: DriftWatch, log: logging.Logger) -> None:
+        self._config, self._drift, self._log = config, drift, log
+        self._names = [camera.name for camera in config.cameras]
+        self._spool = Spool(config.spool.folder)
+        self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[Begun | Ended] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="scan writer", daemon=True)
+        self._thread.start()
+        self._tasks.put(self._settle_abandoned)
+
+    def begin(self, order: Order) -> None:
+        """Note that an order is taken up; `Begun` or `Ended` follows."""
+        self._tasks.put(partial(self._guarded, order, partial(self._begin, order)))
+
+    def refuse(self, order: Order, reason: str) -> None:
+        """Give an order that was not taken up its verdict."""
+        self._tasks.put(partial(self._refuse, order, reason))
+
+    def fail(self, order: Order, reason: str) -> None:
+        """Give a scan that is being collected its verdict."""
+        self._tasks.put(partial(self._failed, order, reason))
+
+    def write(self, collection: Collection) -> None:
+        """Write a complete collection's bundle; `Ended` follows."""
+        self._tasks.put(partial(self._guarded, collection.order, partial(self._write, collection)))
+
+    def events(self) -> Iterator[Begun | Ended]:
+        """What has happened since the last call."""
+        while True:
+            try:
+                yield self._events.get_nowait()
+            except queue.Empty:
+                return
+
+    def close(self) -> None:
+        """End after what is being written."""
+        self._tasks.put(None)
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (task := self._tasks.get()) is not None:
+            try:
+                task()
+            except Exception:
+                self._log.exception("a scan's verdict could not be given")
+
+    def _guarded(self, order: Order, task: Callable[[], None]) -> None:
+        """Whatever goes wrong is the scan's verdict, unless it was accepted all the same."""
+        try:
+            task()
+        except BoothError as error:
+            self._failed(order, str(error))
+        except OSError as error:
+            self._failed(
+                order,
+                f"the spool does not take the scan ({error.strerror or error}); check its disk "
+                "with station status and scan again",
+            )
+        except Exception as error:
+            self._log.exception("scan %s", order.scan_id)
+            self._failed(order, f"the scan could not be written ({error}); scan again")
+
+    def _begin(self, order: Order) -> None:
+        spool = self._spool
+        note = spool.notes.read(order.scan_id)
+        if (note is not None and note.stage != "armed") or spool.where(order.scan_id):
+            # The same order once more: its verdict stands.
+            self._events.put(Ended(order.scan_id, True, ""))
+            return
+        spool.check_space(self._config.spool.min_free_mb)
+        rig = Rig.load(self._config.calibration)
+        for name in self._names:
+            rig.camera(name, str(self._config.calibration))
+        note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
+        spool.notes.write(note, durable=False)
+        if order.late(time.monotonic()):
+            raise BoothError(LATE)
+        self._events.put(Begun(order, rig))
+
+    def _refuse(self, order: Order, reason: str) -> None:
+        spool = self._spool
+        note = self._patiently(partial(spool.notes.read, order.scan_id))
+        if note is None or note.stage == "armed":
+            self._failed(order, reason)
+
+    def _write(self, collection: Collection) -> None:
+        order, rig = collection.order, collection.rig
+        if self._config.drift.refuse_scans:
+            self._refuse_moved_cameras(collection)
+        spool = self._spool
+        temporary = spool.temporary(order.scan_id)
+        write_bundle(
+            temporary,
+            scan_id=order.scan_id,
+            created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+            label=order.label,
+            depth_scale_m=collection.depth_scale_m(),
+            rig=rig,
+            frames={name: _captured(collection, name) for name in self._names},
+            spread_s_max=max(found.spread_s for found in collection.sets),
+        )
+        spool.submit(temporary, order.scan_id)
+        self._log.info(
+            "scan %s written %.2f s after its last frameset",
+            order.scan_id,
+            time.monotonic() - collection.complete_s,
+        )
+        self._end(order.scan_id, True, "")
+
+    def _refuse_moved_cameras(self, collection: Collection) -> None:
+        """A scan through a wrong calibration is worth nothing: say so while the person is there.
+
+        Raises:
+            CalibrationError: naming the cameras that moved.
+        """
+        moved = [
+            move.words()
+            for name in self._names
+            for move in self._drift.moves(
+                collection.rig.cameras[name],
+                [found.frames[name].depth for found in collection.sets],
+                collection.sets[0].frames[name].header.depth_scale_m,
+            )
+            if move.moved or move.lost
+        ]
+        if moved:
+            raise CalibrationError(
+                f"{'; '.join(moved)}; look at it, then run station check, or station calibrate"
+            )
+
+    def _failed(self, order: Order, reason: str) -> None:
+        """The scan failed, unless its bundle got into the queue before what went wrong."""
+        spool = self._spool
+        if self._patiently(partial(spool.where, order.scan_id)) is not None:
+            self._end(order.scan_id, True, "")
+            return
+        note = ScanNote(order.scan_id, "failed", label=order.label, reason=reason, boot=boot_id())
+        self._patiently(partial(spool.notes.write, note, durable=False))
+        self._end(order.scan_id, False, reason)
+
+    def _end(self, scan_id: ScanId, accepted: bool, reason: str) -> None:
+        self._log.info("scan %s %s %s", scan_id, "accepted" if accepted else "failed", reason)
+        self._events.put(Ended(scan_id, accepted, reason))
+
+    def _settle_abandoned(self) -> None:
+        """Give the scans that an earlier sync left behind their verdict: nobody collects them."""
+        spool = self._spool
+        self._patiently(spool.sweep)
+        for scan_id in self._patiently(spool.notes.ids):
+            note = self._patiently(partial(spool.notes.read, scan_id))
+            if note is None or note.stage not in ("armed", "capturing"):
+                continue
+            same_boot = note.boot == boot_id()
+            order = Order(scan_id, note.label, note.valid_until_s)
+            if note.stage == "armed" and same_boot and not order.late(time.monotonic()):
+                continue
+            if self._patiently(partial(spool.where, scan_id)) is None:
+                # It may have been delivered and taken away between the two looks.
+                again = self._patiently(partial(spool.notes.read, scan_id))
+                if again is not None and again.stage in ("armed", "capturing"):
+                    self._failed(order, _ENDED if note.stage == "capturing" else LATE)
+
+    def _patiently(self, call: Callable[[], T]) -> T:
+        """Ask the disk until it answers: a verdict must not depend on its mood."""
+        told = False
+        while True:
+            try:
+                return call()
+            except OSError as error:
+                if self._stop.is_set():
+                    raise
+                if not told:
+                    self._log.warning("waiting for the spool's disk: %s", error)
+                told = True
+                self._stop.wait(_DISK_RETRY_S)
+
+
+def _captured(collection: Collection, name: str) -> list[CapturedFrame]:
+    """A camera's frames of all framesets."""
+    frames = [found.frames[name] for found in collection.sets]
+    return [
+        CapturedFrame(
+            frame.depth,
+            frame.header.device_ticks,
+            frame.header.tick_hz,
+            frame.header.host_time_s,
+            frame.header.sequence,
+        )
+        for frame in frames
+    ]

@@ -1,0 +1,108 @@
+"""Whether a camera's frames are what a living sensor gives (pure).
+
+A sensor that hangs may go on sending its last picture, or pictures with one time stamp: in a shop
+those would be of the previous customer. Such frames enter no frameset, and the camera is named.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from dataclasses import dataclass, field
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.messaging.messages import FrameHeader
+from station.sensors.base import is_serial
+
+LEAST_RATE_HZ = 25.0
+"""A Kinect gives 30; one that falls back to 15 shares its USB controller."""
+_ROWS_LOOKED_AT = 8
+"""Every eighth row: two pictures with the same noise in all of them are one picture."""
+_REPEATS_NAMED = 5
+"""A sixth of a second; a single frame that comes twice is only left out."""
+_REMEMBERED_S = 1.0
+_STEPS = 15
+"""Half a second of frames: a rate is known before a scan can be ordered."""
+
+
+@dataclass(slots=True)
+class CameraTruth:
+    """What one camera's frames say of it. Feed it every frame."""
+
+    _ticks: int | None = None
+    _sequence: int = 0
+    _picture: int | None = None
+    _same_pictures: int = 0
+    _same_stamps: int = 0
+    _trouble: str = ""
+    _trouble_s: float = -1e9
+    _steps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_STEPS))
+    """Seconds of the device's clock from frame to frame."""
+
+    def usable(self, header: FrameHeader, depth: NDArray[np.uint16]) -> bool:
+        """Whether a frame may enter a frameset."""
+        picture = zlib.crc32(np.ascontiguousarray(depth[::_ROWS_LOOKED_AT]).data)
+        again = picture == self._picture
+        stuck = header.device_ticks == self._ticks
+        self._same_pictures = self._same_pictures + 1 if again else 0
+        self._same_stamps = self._same_stamps + 1 if stuck else 0
+        if self._ticks is not None:
+            ticks, frames = header.device_ticks - self._ticks, header.sequence - self._sequence
+            # A counter that wrapped or was reset says nothing of the rate.
+            if ticks > 0 and frames > 0:
+                self._steps_s.append(ticks / header.tick_hz / frames)
+        self._picture, self._ticks = picture, header.device_ticks
+        self._sequence = header.sequence
+        if self._same_stamps >= _REPEATS_NAMED:
+            self._name("its time stamps stand still", header.received_s)
+        elif self._same_pictures >= _REPEATS_NAMED:
+            self._name("it sends the same picture again and again", header.received_s)
+        return not (again or stuck)
+
+    def rate_hz(self) -> float | None:
+        """Frames a second by the device's own clock; None before enough have come."""
+        return 1.0 / median(self._steps_s) if len(self._steps_s) == _STEPS else None
+
+    def trouble(self, now_s: float) -> str:
+        """What is wrong and what to do, or nothing."""
+        if now_s - self._trouble_s < _REMEMBERED_S:
+            return f"{self._trouble}; unplug the sensor and plug it in again"
+        rate_hz = self.rate_hz()
+        if rate_hz is not None and rate_hz < LEAST_RATE_HZ:
+            return (
+                f"it gives {rate_hz:.0f} frames a second, {LEAST_RATE_HZ:.0f} are needed; "
+                "give it a USB controller of its own"
+            )
+        return ""
+
+    def _name(self, trouble: str, now_s: float) -> None:
+        self._trouble, self._trouble_s = trouble, now_s
+
+
+def wrong_sensors(found: dict[str, str], calibrated: dict[str, str]) -> list[str]:
+    """What is wrong with which sensor is which camera: one sentence each.
+
+    Args:
+        found, calibrated: camera -> serial number, as it is now and when it was calibrated.
+    """
+    wrong = []
+    owners: dict[str, str] = {}
+    for name, serial in found.items():
+        if not is_serial(serial):
+            continue
+        if serial in owners:
+            wrong.append(
+                f"cameras {owners[serial]} and {name} are one sensor ({serial}); "
+                "correct the serials in booth.toml"
+            )
+        owners[serial] = name
+        known = calibrated.get(name, "")
+        if is_serial(known) and known != serial:
+            wrong.append(
+                f"camera {name} is sensor {serial}, but {known} was calibrated; "
+                "put the sensors back where they were, or calibrate: station calibrate"
+            )
+    return wrong

@@ -1,0 +1,138 @@
+"""One job in a process of its own, seen from the pool: the order, the wait, how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from station.core.config import BoothConfig
+
+_LOOK_S = 0.2
+_ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
+
+Blame = Literal["scan", "job", "station", "disk", "nobody"]
+"""Who caused a bad end: the scan cannot be used; the job crashed or hung; something outside ended
+the process; the disk refused; the station is being stopped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a job ended."""
+
+    status: str = ""
+    """What the result says ("ok" or "rescan"); empty: there is none."""
+    reason: str = ""
+    """Why to scan again, or why there is no result."""
+    blame: Blame = "nobody"
+
+
+class JobProcess:
+    """One warmed-up process for one job."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "workers.reconstruct.job_process", str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+
+    def send(self, bundle: Path, out: Path, config: BoothConfig) -> None:
+        """Give it the job. One that died before it began is found out by `outcome`."""
+        order = {
+            "bundle": str(bundle),
+            "out": str(out),
+            "method": config.workers.method,
+            "volume": config.volume.model_dump(),
+        }
+        stdin = self._process.stdin
+        assert stdin is not None
+        try:
+            stdin.write((json.dumps(order) + "\n").encode())
+            stdin.close()
+        except BrokenPipeError:
+            return
+
+    def outcome(
+        self, timeout_s: float, stop: threading.Event, begun: Callable[[], None]
+    ) -> Outcome:
+        """Wait for the job's end; it is killed when it takes too long or the station stops.
+
+        Args:
+            begun: called once, when the process is warm and does its job.
+        """
+        process = self._process
+        last = self._last_message(time.monotonic() + timeout_s, stop, begun)
+        if last is None:
+            self.kill()
+            if stop.is_set():
+                return Outcome(reason="the station was stopped")
+            return Outcome(reason=f"the job hung for {timeout_s:g} s", blame="job")
+        process.wait()
+        if "error" in last:
+            return Outcome(reason=str(last["error"]), blame="scan")
+        if "disk" in last:
+            return Outcome(reason=str(last["disk"]), blame="disk")
+        if "died" in last:
+            return Outcome(reason=str(last["died"]), blame="job")
+        if "status" in last and process.returncode == 0:
+            reasons = last.get("reasons")
+            words = "; ".join(map(str, reasons)) if isinstance(reasons, list) else ""
+            return Outcome(status=str(last["status"]), reason=words)
+        return _died(process.returncode)
+
+    def _last_message(
+        self, deadline_s: float, stop: threading.Event, begun: Callable[[], None]
+    ) -> dict[str, object] | None:
+        """The last line that the process says before it ends; None at the deadline or the stop."""
+        stdout = self._process.stdout
+        assert stdout is not None
+        last: dict[str, object] = {}
+        pending, warm = b"", False
+        with selectors.DefaultSelector() as selector:
+            selector.register(stdout, selectors.EVENT_READ)
+            while True:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0.0 or stop.is_set():
+                    return None
+                if not selector.select(min(left_s, _LOOK_S)):
+                    continue
+                piece = stdout.read1(65536)  # type: ignore[attr-defined]  # a BufferedReader
+                if not piece:
+                    return last
+                *lines, pending = (pending + piece).split(b"\n")
+                for line in lines:
+                    last = json.loads(line)
+                if not warm and "step" in last:
+                    warm = True
+                    begun()
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+
+def _died(code: int) -> Outcome:
+    if code in _ENDED_FROM_OUTSIDE:
+        return Outcome(reason=f"the job was ended by {_signal(code)}", blame="station")
+    how = f"by {_signal(code)}" if code < 0 else f"with code {code}"
+    return Outcome(reason=f"the job ended unexpectedly, {how}", blame="job")
+
+
+def _signal(code: int) -> str:
+    return signal.Signals(-code).name
