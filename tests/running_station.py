@@ -25,7 +25,11 @@ class Station:
             self.process = subprocess.Popen(
                 [*STATION, "run"], env=self._environment, stdout=log, stderr=subprocess.STDOUT
             )
-        self.wait_until(lambda: self.command("status").returncode == 0, "control answers")
+        try:
+            self.wait_until(lambda: self.command("status").returncode == 0, "control answers")
+        except BaseException:
+            self.close()
+            raise
 
     def command(self, *words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shutil
+import struct
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.errors import BundleError, CalibrationError
-from station.core.files import private_folder, read_json, write_json
+from station.core.files import private_folder, read_json, read_regular, write_json
 from station.core.rig import Rig
 
 FORMAT = "booth-bundle"
@@ -27,6 +29,10 @@ _PNG_FAST = [
 """A sensor knows few different depths: whole readings repeat, differences of neighbours do not. So
 files are smaller unfiltered, and quicker to write and to read."""
 _ENCODERS = 2
+_PNG_SLACK_BYTES = 1 << 16
+"""Beyond twice the pixels' own size, which no PNG of noise reaches."""
+MOST_CAMERAS, MOST_FRAMES = 64, 1000
+_MOST_COUNT = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +71,24 @@ class Bundle:
             BundleError: the file is missing, torn, or not a 16-bit image of the camera's size.
         """
         path = self.folder / record.file
-        try:
-            encoded = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        except OSError as cause:
-            raise BundleError(f"{path} cannot be read ({cause.strerror}); scan again") from None
-        if not _is_whole_png(encoded):
-            raise BundleError(f"{path} is torn or not a PNG; scan again")
-        image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        if any(parent.is_symlink() for parent in path.parents if parent != self.folder.parent):
+            raise BundleError(f"{path} lies behind a link; scan again")
         calibration = self.rig.cameras[camera]
         expected = (calibration.height, calibration.width)
+        most_bytes = 2 * 2 * calibration.height * calibration.width + _PNG_SLACK_BYTES
+        try:
+            data = read_regular(path, most_bytes)
+        except OSError as cause:
+            raise BundleError(f"{path} cannot be read ({cause.strerror}); scan again") from None
+        except ValueError as cause:
+            raise BundleError(f"{path} {cause}; scan again") from None
+        # Looked at before decoding: a small file may claim to be an image of gigabytes.
+        found = _png_size(data)
+        if found is None:
+            raise BundleError(f"{path} is torn or not a PNG; scan again")
+        if found != expected:
+            raise BundleError(f"{path} is {found}; camera {camera} needs uint16 {expected}")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise BundleError(f"{path} is torn or not a PNG; scan again")
         if image.dtype != np.uint16 or image.shape != expected:
@@ -87,10 +102,17 @@ class Bundle:
         return np.stack([self.read_frame(camera, record) for record in self.frames[camera]])
 
 
-def _is_whole_png(encoded: NDArray[np.uint8]) -> bool:
-    """OpenCV decodes a torn PNG to black rows in silence: ask for its first and last chunk."""
-    data = encoded.tobytes()
-    return data.startswith(b"\x89PNG\r\n\x1a\n") and data[-8:-4] == b"IEND"
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    """Height and width that a PNG's first chunk tells; None if it is torn or none.
+
+    OpenCV decodes a torn PNG to black rows in silence, so its last chunk is asked for, too.
+    """
+    if not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
+        return None
+    if data[-8:-4] != b"IEND":
+        return None
+    width, height = struct.unpack(">II", data[16:24])
+    return height, width
 
 
 def read_bundle(folder: Path) -> Bundle:
@@ -102,7 +124,7 @@ def read_bundle(folder: Path) -> Bundle:
         CalibrationError: a camera of the bundle is not in its calibration.
     """
     path = folder / MANIFEST
-    if not folder.is_dir():
+    if folder.is_symlink() or not folder.is_dir():
         raise BundleError(f"{folder} is not a folder; give the folder of a scan bundle")
     document = read_json(path, format=FORMAT, versions=VERSIONS, error=BundleError)
     rig = Rig.load(folder / CALIBRATION)
@@ -125,8 +147,14 @@ def read_bundle(folder: Path) -> Bundle:
         )
     except KeyError as missing:
         raise BundleError(f"{path}: the field {missing} is missing; scan again") from None
-    except (TypeError, ValueError, AttributeError) as cause:
+    except (TypeError, ValueError, AttributeError, OverflowError) as cause:
         raise BundleError(f"{path}: {cause}; scan again") from None
+    if len(frames) > MOST_CAMERAS or any(len(f) > MOST_FRAMES for f in frames.values()):
+        raise BundleError(
+            f"{path}: at most {MOST_CAMERAS} cameras with {MOST_FRAMES} frames each are read"
+        )
+    if not (math.isfinite(bundle.spread_s_max) and bundle.spread_s_max >= 0.0):
+        raise BundleError(f"{path}: spread_s_max is {bundle.spread_s_max}; scan again")
     if not (np.isfinite(scale) and 0.0 < scale < 0.1):
         raise BundleError(f"{path}: depth_scale_m is {scale}; metres per unit were expected")
     if not any(frames.values()):
@@ -145,14 +173,23 @@ def _record(entry: Mapping[str, Any]) -> FrameRecord:
     file = str(entry["file"])
     name = PurePosixPath(file)
     if name.is_absolute() or ".." in name.parts:
-        raise ValueError(f"the frame file {file!r} lies outside the bundle")
-    return FrameRecord(
+        raise ValueError(f"the frame file {file!a:.80} lies outside the bundle")
+    if not file.isprintable():
+        raise ValueError(f"the frame file {file!a:.80} has letters that no file's name has")
+    record = FrameRecord(
         file=file,
         device_ticks=int(entry["device_ticks"]),
         tick_hz=float(entry["tick_hz"]),
         host_time_s=float(entry["host_time_s"]),
         sequence=int(entry["sequence"]),
     )
+    if not (math.isfinite(record.tick_hz) and record.tick_hz > 0.0):
+        raise ValueError(f"{file}: tick_hz is {record.tick_hz}")
+    if not math.isfinite(record.host_time_s):
+        raise ValueError(f"{file}: host_time_s is {record.host_time_s}")
+    if not all(0 <= count < _MOST_COUNT for count in (record.device_ticks, record.sequence)):
+        raise ValueError(f"{file}: device_ticks or sequence is negative or too large")
+    return record
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ Reads and writes ``calibration.json`` (format "booth-calibration", version 1).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from station.core.files import read_json, write_json
 
 FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
+MOST_PIXELS = 4096
+"""On a side of a depth image; no depth sensor has more."""
 _ROTATION_TOLERANCE = 1e-4
 
 Array = NDArray[np.float64]
@@ -158,7 +160,7 @@ class Rig:
             )
         except KeyError as missing:
             raise FormatError(f"{path}: the field {missing} is missing; calibrate anew") from None
-        except (ValueError, TypeError, AttributeError) as cause:
+        except (ValueError, TypeError, AttributeError, OverflowError) as cause:
             raise FormatError(f"{path}: {cause}; calibrate anew") from None
         if not rig.cameras:
             raise FormatError(f"{path}: there is no camera in it; calibrate anew")
@@ -184,8 +186,8 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"camera {name}: K must have positive focal lengths")
     width, height = int(fields["width"]), int(fields["height"])
-    if width <= 0 or height <= 0:
-        raise ValueError(f"camera {name}: width and height must be positive")
+    if not (0 < width <= MOST_PIXELS and 0 < height <= MOST_PIXELS):
+        raise ValueError(f"camera {name}: width and height must lie between 1 and {MOST_PIXELS}")
     return CameraCalibration(
         name=name,
         serial=str(fields["serial"]),
@@ -196,8 +198,20 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
         distortion=matrix("distortion", (5,)),
         depth_correction=_correction(name, fields["depth_correction"]),
         world_from_camera=pose,
-        covariance=None if fields.get("covariance") is None else matrix("covariance", (6, 6)),
+        covariance=_covariance(name, fields, matrix),
     )
+
+
+def _covariance(
+    name: str, fields: Mapping[str, Any], matrix: Callable[[str, tuple[int, ...]], Array]
+) -> Array | None:
+    if fields.get("covariance") is None:
+        return None
+    found = matrix("covariance", (6, 6))
+    scale = max(float(np.abs(found).max()), 1e-30)
+    if np.abs(found - found.T).max() > 1e-6 * scale or np.linalg.eigvalsh(found)[0] < -1e-6 * scale:
+        raise ValueError(f"camera {name}: covariance is not symmetric and positive")
+    return found
 
 
 def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:

@@ -1,4 +1,6 @@
 import json
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -111,3 +113,68 @@ def test_contradictions_are_refused(
 def test_a_folder_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="is not a folder"):
         read_bundle(tmp_path / "nothing")
+
+
+def test_an_images_size_is_looked_at_before_it_is_decoded(bundle_folder: Path) -> None:
+    """A PNG of 30 kB that claimed 30000 x 30000 pixels took 3.8 GB."""
+    path = bundle_folder / "depth/front/001.png"
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack(">II", 30_000, 30_000)
+    path.write_bytes(bytes(data))
+    with pytest.raises(BundleError, match=r"001\.png is \(30000, 30000\)"):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "/etc/hostname"])
+def test_no_link_is_followed(bundle_folder: Path, target: str) -> None:
+    path = bundle_folder / "depth/front/001.png"
+    path.unlink()
+    path.symlink_to(target)
+    with pytest.raises(BundleError, match="is a link"):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+def test_no_pipe_is_waited_for(bundle_folder: Path) -> None:
+    path = bundle_folder / "bundle.json"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(BundleError, match="not a regular file"):
+        read_bundle(bundle_folder)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"format": "booth-bundle", "version": 1e400}', '{"a": ' * 50_000]
+)
+def test_strange_json_is_refused_in_one_line(bundle_folder: Path, text: str) -> None:
+    (bundle_folder / "bundle.json").write_text(text)
+    with pytest.raises(FormatError):
+        read_bundle(bundle_folder)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tick_hz", 0),
+        ("host_time_s", float("nan")),
+        ("sequence", -1),
+        ("device_ticks", 1e400),
+        ("device_ticks", 10**400),
+        ("file", "a\0b"),
+        ("file", 7),
+    ],
+)
+def test_impossible_numbers_are_refused(bundle_folder: Path, field: str, value: object) -> None:
+    cameras = json.loads((bundle_folder / "bundle.json").read_text())["cameras"]
+    cameras["front"]["frames"][1][field] = value
+    _edit(bundle_folder, cameras=cameras)
+    with pytest.raises(BundleError):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+def test_a_negative_covariance_is_refused(bundle_folder: Path) -> None:
+    path = bundle_folder / "calibration.json"
+    document = json.loads(path.read_text())
+    document["cameras"]["front"]["covariance"] = (-np.eye(6)).tolist()
+    path.write_text(json.dumps(document))
+    with pytest.raises(FormatError, match="covariance is not symmetric and positive"):
+        read_bundle(bundle_folder)
