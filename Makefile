@@ -42,7 +42,7 @@ evaluate-model: $(VENV)/train.stamp
 	$(BIN)/reconstruct evaluate-model $(ARGS)
 
 intervals: $(VENV)/train.stamp
-	$(BIN)/python tests/bench/bench_measure.py --calibrate 96 $(ARGS)
+	$(BIN)/python tests/bench/bench_measure.py --calibrate 64 $(ARGS)
 
 package: $(VENV)/dev.stamp
 	$(BIN)/python deploy/package/build.py $(ARGS)

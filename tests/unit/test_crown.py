@@ -19,7 +19,7 @@ from station.simulation.scene import (
 )
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.crown import crown_rows
+from workers.scape.evidence.crown import crown_rows, crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel, load_model
@@ -179,3 +179,29 @@ def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
 
     assert missing([]) > 0.002
     assert abs(missing([view, view])) < 0.0015
+
+
+def test_a_head_that_nobody_saw_end_has_a_height_of_its_own_uncertainty(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    """A man came out 14 mm too tall with no wall in range behind his head, and was sure of it."""
+
+    def sigma_m(view: CameraView, fitted: np.ndarray) -> float:
+        local = (rays(UPPER) * view.depth_m[..., None])[view.depth_m > 0].astype(np.float64)
+        pose = view.calibration.world_from_camera
+        return crown_sigma_m(model, [view], [pose], fitted, transform(pose, local))
+
+    assert sigma_m(_view(model, body), body) == 0.0
+    open_air = _view(model, body, walls=False)
+    assert 0.0025 < sigma_m(open_air, body) < 0.005
+    too_tall = body + 2.0 * HIGHER * (body[:, 2:] > body[:, 2].max() - 0.1)
+    assert sigma_m(open_air, too_tall) == pytest.approx(0.008)
+    assert sigma_m(_view(model, body, bald=False), body) == pytest.approx(0.008)
+
+
+def test_a_scanner_that_sees_the_top_of_a_head_adds_little(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    dense = body[model.faces].mean(axis=1)
+    assert crown_sigma_m(model, [], [], body, np.concatenate([body, dense])) <= 0.003
+    assert crown_sigma_m(model, [], [], body, body[body[:, 2] < 1.2]) == pytest.approx(0.03)

@@ -22,7 +22,15 @@ from workers.measure.body import measure_body, measure_standing
 from workers.measure.coverage import SeenSkin
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.differences import side_differences
-from workers.measure.intervals import SHIPPED, ErrorModel, learned, shipped, sides_pooled
+from workers.measure.intervals import (
+    SHIPPED,
+    ErrorModel,
+    RowErrors,
+    ScanErrors,
+    learned,
+    shipped,
+    sides_pooled,
+)
 from workers.measure.kinds import Route, Section
 from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
@@ -201,26 +209,44 @@ def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:
 
 
 def test_intervals_hold_what_they_promise() -> None:
-    """Errors whose size the posterior knows in part: narrow where it is sure, 95 of 100 held."""
+    """Ordinary scans by a constant, strange ones by what they show: 95 of 100 held in either."""
     rng = np.random.default_rng(0)
 
-    def draw(count: int) -> tuple[np.ndarray, np.ndarray]:
-        sigmas = rng.uniform(0.5e-3, 3e-3, count)
-        return 2e-3 + np.hypot(1e-3, 2.0 * sigmas) * rng.standard_normal(count), sigmas
+    def draw(count: int, strangeness: float) -> RowErrors:
+        sigmas = strangeness * rng.uniform(0.5e-3, 3e-3, count)
+        errors = 2e-3 + np.hypot(1e-3, 4.0 * sigmas) * rng.standard_normal(count)
+        return RowErrors(errors, sigmas)
 
-    found = learned(*draw(400))
-    errors, sigmas = draw(4000)
-    ends = np.array([found.interval(1.0 + e, s) for e, s in zip(errors, sigmas, strict=True)])
-    held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
-    assert 0.93 < held.mean() < 0.975
-    width = ends[:, 1] - ends[:, 0]
-    assert width[sigmas > 2.5e-3].mean() > 2.0 * width[sigmas < 1e-3].mean()
+    found = learned(draw(400, 0.05), draw(200, 1.0))
     assert found.bias == pytest.approx(2e-3, abs=6e-4)
+    for strangeness in (0.05, 1.0):
+        scans = draw(4000, strangeness)
+        pairs = zip(scans.errors, scans.sigmas, strict=True)
+        ends = np.array([found.interval(1.0 + e, s) for e, s in pairs])
+        held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
+        assert 0.92 < held.mean() < 0.985
+        width = ends[:, 1] - ends[:, 0]
+        assert (width.mean() > 0.01) == (strangeness == 1.0)
 
 
 def test_chance_does_not_pass_for_a_systematic_error() -> None:
-    errors = np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10)
-    assert learned(errors, np.full(40, 1e-3)).bias == 0.0
+    errors = RowErrors(np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10), np.zeros(40))
+    assert learned(errors, errors).bias == 0.0
+    assert learned(errors, errors).gain == 0.0
+
+
+def test_what_a_scan_says_of_itself_widens_the_rows_it_concerns(model: BodyModel) -> None:
+    sigma, seen = np.full(model.vertex_count, 3e-4), np.ones(model.vertex_count, bool)
+    usual, doubtful = (
+        {
+            row.name: row.interval95_m
+            for row in measure_body(model, model.mean, sigma, seen, errors).rows
+        }
+        for errors in (ScanErrors(), ScanErrors(girth_sigma_m=0.004, crown_sigma_m=0.008))
+    )
+    assert doubtful["height"][1] - doubtful["height"][0] > 0.031
+    assert doubtful["knee_height"] == usual["knee_height"]
+    assert doubtful["waist_girth"][1] > usual["waist_girth"][1] + 0.0005
 
 
 def test_an_interval_holds_its_value() -> None:

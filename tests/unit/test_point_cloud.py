@@ -57,3 +57,52 @@ def test_what_can_be_no_body_is_refused(
     o3d.io.write_point_cloud(path, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
     with pytest.raises(InputError, match=words):
         read_cloud(path, "z")
+
+
+def _person(rng: np.random.Generator, count: int = 8000) -> np.ndarray:
+    """A pillar of a person's size, on both of its feet."""
+    angle, height = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.0, 1.75, count)
+    return np.column_stack([0.18 * np.cos(angle), 0.12 * np.sin(angle), height])
+
+
+@pytest.mark.parametrize(
+    ("scale", "turn", "words"),
+    [
+        (1000.0, False, "looks like millimetres; use --unit mm"),
+        (100.0, False, "looks like centimetres; use --unit cm"),
+        (1 / 0.0254, False, "looks like inches; use --unit in"),
+        (1.0, True, r"lying down\? say which axis points up: --up y"),
+    ],
+)
+def test_other_units_and_axes_are_named(
+    tmp_path: Path, scale: float, turn: bool, words: str
+) -> None:
+    points = scale * _person(np.random.default_rng(2))
+    path = _written(tmp_path / "a.ply", points[:, [0, 2, 1]] if turn else points)
+    with pytest.raises(InputError, match=words):
+        read_cloud(path, "z")
+
+
+def test_a_cloud_in_millimetres_is_read_as_such(tmp_path: Path) -> None:
+    points = _person(np.random.default_rng(2))
+    path = _written(tmp_path / "a.ply", 1000.0 * points)
+    assert np.ptp(read_cloud(path, "z", "mm").points[:, 2]) == pytest.approx(1.75, abs=0.01)
+
+
+def test_the_floor_and_what_stands_on_it_are_taken_away(tmp_path: Path) -> None:
+    """A slanted floor 0.4 m below the scanner's origin, and a stool in the corner."""
+    rng = np.random.default_rng(3)
+    floor = np.column_stack([rng.uniform(-1.5, 1.5, (20_000, 2)), np.zeros(20_000)])
+    stool = rng.uniform((1.0, 1.0, 0.0), (1.3, 1.3, 0.45), (2000, 3))
+    points = np.concatenate([_person(rng), floor, stool])
+    points[:, 2] += 0.01 * points[:, 0] - 0.4 + 0.002 * rng.standard_normal(len(points))
+    cloud = read_cloud(_written(tmp_path / "a.ply", points), "z")
+    assert 7500 < len(cloud) <= 8000
+    assert np.abs(cloud.points[:, :2]).max() < 0.2
+    assert cloud.points[:, 2].max() == pytest.approx(1.75, abs=0.01)
+    assert cloud.origin_m[2] == pytest.approx(-0.4, abs=0.005)
+
+
+def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:
+    points = _person(np.random.default_rng(4))
+    assert len(read_cloud(_written(tmp_path / "a.ply", points), "z")) == len(points)

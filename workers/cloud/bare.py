@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
+from workers.cloud.floor import UNITS_M, check_units, standing_on
 from workers.cloud.observed import LEAST_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 _MOST_POINTS = 250_000
+_Z_FROM_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation of a cloud whose y points up."""
 _NORMAL_NEIGHBOURS = 24
 """Neighbours that a normal is estimated from."""
 _ORIENTED, _OPPOSITE = 25_000, 12_000
@@ -39,19 +42,54 @@ _OFF_FLOOR_M = 0.05
 """Largest distance of a mesh's soles from the floor, which heights are measured from."""
 
 
-def read_cloud(path: Path, up: str) -> PointCloud:
-    """Read a cloud in metres and move its middle to the mark and its lowest points to the floor.
+def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
+    """Read a cloud and move its middle to the mark and its lowest points, or its floor, to z = 0.
 
-    A cloud whose lowest points are slightly above z = 0, as where no camera saw the soles, keeps
-    its heights. `origin_m` of the cloud is the new origin in the file's frame, after `up`. The same
+    A floor that was scanned too is taken away, and what stands apart on it. A cloud whose lowest
+    points are slightly above z = 0, as where no camera saw the soles, keeps its heights.
+    `origin_m` of the cloud is the new origin in the file's frame, in metres, after `up`. The same
     file gives the same points.
 
     Args:
         up: "z" or "y", the axis that points up.
+        unit: of the file, a key of `UNITS_M`.
 
     Raises:
-        InputError: the file is missing, is not a cloud, or has values that are not finite.
+        InputError: the file is missing, is not a cloud, has values that are not finite, or looks
+            like another unit or axis than was said.
     """
+    cloud = _points_of(path)
+    cloud.scale(UNITS_M[unit], np.zeros(3))
+    if up == "y":
+        cloud.rotate(_Z_FROM_Y, np.zeros(3))
+    check_units(np.asarray(cloud.points), unit, up)
+    person = standing_on(np.asarray(cloud.points))
+    if person is not None:
+        cloud = cloud.select_by_index(np.flatnonzero(person[0]))
+    if not cloud.has_normals():
+        _estimate_normals(cloud, path)
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    middle = np.median(points, axis=0)
+    if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
+        normals = -normals
+    if person is None:
+        low_m = float(points[:, 2].min())
+        middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
+    else:
+        middle[2] = person[1]
+    x, y, z = (float(value) for value in middle)
+    return PointCloud(
+        points=points - middle,
+        normals=normals,
+        sigma_m=np.full(len(points), _SIGMA_M),
+        camera=np.zeros(len(points), np.int16),
+        camera_names=("cloud",),
+        origin_m=(x, y, z),
+    )
+
+
+def _points_of(path: Path) -> o3d.geometry.PointCloud:
+    """Points of a file, thinned to what the fit can use."""
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a point cloud, .ply or .pcd")
     cloud = o3d.io.read_point_cloud(path)
@@ -65,31 +103,27 @@ def read_cloud(path: Path, up: str) -> PointCloud:
     if len(points) > _MOST_POINTS:
         kept = np.random.default_rng(len(points)).permutation(len(points))[:_MOST_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
-    if not cloud.has_normals():
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
-        try:
-            cloud.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
-        except RuntimeError as error:
-            raise InputError(f"{path} is flat; a body has a front and a back") from error
-        normals = _consistent(np.asarray(cloud.points), np.asarray(cloud.normals))
-        cloud.normals = o3d.utility.Vector3dVector(normals)
+    return cloud
+
+
+def _estimate_normals(cloud: o3d.geometry.PointCloud, path: Path) -> None:
+    """Give a cloud normals that point out of the body or into it.
+
+    Orientation along a spanning tree takes minutes on large clouds: it is done on some points, and
+    the others follow the nearest of them.
+    """
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    if up == "y":
-        points, normals = points[:, [0, 2, 1]] * (1, -1, 1), normals[:, [0, 2, 1]] * (1, -1, 1)
-    middle = np.median(points, axis=0)
-    if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
-        normals = -normals
-    low_m = float(points[:, 2].min())
-    middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
-    x, y, z = (float(value) for value in middle)
-    return PointCloud(
-        points=points - middle,
-        normals=normals,
-        sigma_m=np.full(len(points), _SIGMA_M),
-        camera=np.zeros(len(points), np.int16),
-        camera_names=("cloud",),
-        origin_m=(x, y, z),
-    )
+    every = max(1, len(points) // _ORIENTED)
+    some = cloud.select_by_index(np.arange(0, len(points), every))
+    try:
+        some.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
+    except RuntimeError as error:
+        raise InputError(f"{path} is flat; a body has a front and a back") from error
+    nearest = cKDTree(np.asarray(some.points)).query(points, workers=-1)[1]
+    agrees = np.einsum("ni,ni->n", np.asarray(some.normals)[nearest], normals) >= 0.0
+    oriented = np.where(agrees[:, None], normals, -normals)
+    cloud.normals = o3d.utility.Vector3dVector(_consistent(points, oriented))
 
 
 def _consistent(points: Array, normals: Array) -> Array:

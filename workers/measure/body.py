@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workers.measure.coverage import Basis, SeenSkin
-from workers.measure.intervals import Pose, content_interval, intervals, row_values
+from workers.measure.intervals import Pose, ScanErrors, content_interval, intervals, row_values
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
 from workers.scape.model.body_model import BodyModel, BodyState
@@ -16,6 +16,9 @@ from workers.scape.model.deformation import signed_volume, triangle_areas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+ORDINARY = ScanErrors()
+"""Errors of a scan that adds none of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +61,23 @@ def measure_body(
     vertices: Array,
     vertex_sigma_m: Array | None = None,
     vertex_seen: Mask | None = None,
+    scan_errors: ScanErrors = ORDINARY,
 ) -> MeasuredBody:
     """All measurements of a body as it stands.
 
     Args:
         vertices: (P, 3) in the template's topology, z up, floor at 0, metres.
-        vertex_sigma_m: (P,), the fit's posterior standard deviation along the normals. Without it
-            the mesh counts as exact and intervals have no width.
+        vertex_sigma_m: (P,), the fit's standard deviation along the normals. Without it the mesh
+            counts as exact and intervals have no width.
         vertex_seen: (P,), vertices that cameras saw. Without it all count as seen.
+        scan_errors: what concerns the whole scan.
 
     Raises:
         InputError: a plane misses the part of the body that it should cut.
     """
-    return _measured(model, vertices, vertices, "as-scanned", vertex_sigma_m, vertex_seen)
+    return _measured(
+        model, vertices, vertices, "as-scanned", vertex_sigma_m, vertex_seen, scan_errors
+    )
 
 
 def measure_standing(
@@ -79,6 +86,7 @@ def measure_standing(
     state: BodyState,
     vertex_sigma_m: Array | None = None,
     vertex_seen: Mask | None = None,
+    scan_errors: ScanErrors = ORDINARY,
 ) -> MeasuredBody:
     """All measurements of a body in the standard standing pose; their lines lie on the mesh as it
     was scanned.
@@ -86,10 +94,12 @@ def measure_standing(
     Args:
         vertices: (P, 3) as scanned.
         state: the parameters that the vertices were fitted with.
-        vertex_sigma_m, vertex_seen: as in `measure_body`.
+        vertex_sigma_m, vertex_seen, scan_errors: as in `measure_body`.
     """
     standing = stood_upright(model, vertices, state)
-    return _measured(model, standing, vertices, "standard", vertex_sigma_m, vertex_seen)
+    return _measured(
+        model, standing, vertices, "standard", vertex_sigma_m, vertex_seen, scan_errors
+    )
 
 
 def _measured(
@@ -99,6 +109,7 @@ def _measured(
     pose: Pose,
     vertex_sigma_m: Array | None,
     vertex_seen: Mask | None,
+    scan_errors: ScanErrors,
 ) -> MeasuredBody:
     traces = trace_all(model, vertices)
     values = row_values(traces, pose)
@@ -115,7 +126,10 @@ def _measured(
             _parts_of(model, trace),
         )
         for trace, value, interval in zip(
-            traces, values, intervals(traces, values, vertex_sigma_m, pose), strict=True
+            traces,
+            values,
+            intervals(traces, values, vertex_sigma_m, pose, scan_errors),
+            strict=True,
         )
     )
     volume = signed_volume(vertices, model.faces)

@@ -1,16 +1,20 @@
 """95 % intervals of measurements, from a calibrated model of their errors.
 
-The error of a row has two causes: the error of the surface, whose standard deviation the fit gives
-for each vertex, and landmarks that slide along the skin from fit to fit, which it does not know. So
+An ordinary scan of a body of the model's own family errs by an amount that is known for each row.
+To this a scan adds what it shows of itself:
 
-    half width = sqrt(constant^2 + (gain sigma)^2),
+    half width = sqrt(constant^2 + (gain sigma)^2 + (1.96 further)^2),
 
-where sigma is the posterior standard deviation, rms along the row's line. `constant`, `gain` and
-the row's systematic error `bias` are learned from scans of held-out bodies with known dimensions
+where sigma is the standard deviation of the surface in excess of an ordinary scan's, rms along the
+row's line (`workers.scape.surface.uncertainty`), and `further` is what concerns all of the scan:
+the calibration's own statement of its errors, and a top of the head that nobody saw.
+
+`constant` and the row's systematic error `bias` are learned from scans of held-out bodies of the
+family, `gain` from scans of sculpted bodies by a sensor that errs otherwise than the fit assumes
 (conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), so that an interval contains the
-truth in 95 of 100 cases. As scanned, the bias shifts only the interval, since a value is the length
-of its line. In the standard pose, which no camera saw, the bias is the mean error of re-posing the
-body, and it is subtracted from the value.
+truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval, since a value is
+the length of its line. In the standard pose, which no camera saw, the bias is the mean error of
+re-posing the body, and it is subtracted from the value.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.errors import FormatError
+from workers.measure.kinds import Definition, Top
 from workers.measure.tracing import Trace
 
 Array = NDArray[np.float64]
@@ -36,12 +41,12 @@ FORMAT = "booth-intervals"
 VERSION = 1
 SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
-_RATIOS = (0.0, 0.3, 0.6, 1.0, 1.7, 3.0)
-"""Candidates for the ratio of gain times median sigma to constant."""
+_NORMAL_QUANTILE = 1.96
+"""Half width of a 95 % interval over the standard deviation of a normal distribution."""
+_GAIN_ROUNDS = 3
+"""Rounds in which constant and gain are learned in turn; they settle after two."""
 _OUTLIER = 6.0
 """Median absolute deviations beyond which an error does not count to the spread."""
-_NORMAL_MAD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,49 +57,93 @@ class ErrorModel:
     constant: float
     gain: float
 
-    def interval(self, value: float, sigma: float) -> tuple[float, float]:
+    def interval(self, value: float, sigma: float, further: float = 0.0) -> tuple[float, float]:
         """95 % interval of a value whose line has the standard deviation `sigma`.
 
         It always contains the value and no negative length.
+
+        Args:
+            further: standard deviation that concerns the whole scan.
         """
         half = float(np.hypot(self.constant, self.gain * sigma))
+        half = float(np.hypot(half, _NORMAL_QUANTILE * further))
         middle = value - self.bias
         return max(0.0, min(value, middle - half)), max(value, middle + half)
 
 
+@dataclass(frozen=True, slots=True)
+class ScanErrors:
+    """Standard deviations that concern a whole scan, metres."""
+
+    height_sigma_m: float = 0.0
+    """Heights and lengths, by the calibration's own statement."""
+    girth_sigma_m: float = 0.0
+    """Girths, by the same."""
+    crown_sigma_m: float = 0.0
+    """Top of the head."""
+
+    def of(self, definition: Definition) -> float:
+        """Standard deviation of a row."""
+        if definition.quantity in ("girth", "large girth"):
+            return self.girth_sigma_m
+        if isinstance(definition.way, Top):
+            return float(np.hypot(self.height_sigma_m, self.crown_sigma_m))
+        return self.height_sigma_m
+
+
 def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
-    """Posterior standard deviation (m) of the surface, rms along a row's line."""
+    """Standard deviation (m) of the surface, rms along a row's line."""
     tail, head = vertex_sigma_m[trace.points.tail], vertex_sigma_m[trace.points.head]
     along = tail + trace.points.share * (head - tail)
     return float(np.sqrt(np.mean(along**2)))
 
 
-def learned(errors: Array, sigmas: Array) -> ErrorModel:
-    """Error model of a row from the errors (n,) of held-out scans and their line sigmas (n,).
+@dataclass(frozen=True, slots=True)
+class RowErrors:
+    """Errors (n,) of one row on n scans of known bodies, and the standard deviations (n,) of its
+    lines in these scans."""
 
-    The bias is shrunk by its own uncertainty (James & Stein 1961, positive part), so that noise of
-    the calibration is not taken for a systematic error. The ratio of gain to constant is the one of
-    highest likelihood; their size is the conformal quantile.
+    errors: Array
+    sigmas: Array
+
+
+def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
+    """Error model of a row from scans of the model's own family and of bodies unlike it.
+
+    The bias is that of the family, shrunk by its own uncertainty (James & Stein 1961, positive
+    part), so that noise of the calibration is not taken for a systematic error. The constant is the
+    conformal quantile of the family's errors, the gain that of the other bodies' errors beyond the
+    constant, over their sigmas.
     """
+    bias = _shrunk_mean(family.errors)
+    ordinary, strange = np.abs(family.errors - bias), np.abs(unlike.errors - bias)
+    usable = unlike.sigmas > 0.0
+    gain = 0.0
+    for _ in range(_GAIN_ROUNDS):
+        constant = _conformal(_beyond(ordinary, gain * family.sigmas))
+        if usable.any():
+            gain = _conformal(_beyond(strange, constant)[usable] / unlike.sigmas[usable])
+    return ErrorModel(bias, constant, gain)
+
+
+def _shrunk_mean(errors: Array) -> float:
     middle = float(np.median(errors))
-    spread = _NORMAL_MAD * float(np.median(np.abs(errors - middle)))
-    kept = np.abs(errors - middle) <= _OUTLIER * spread / _NORMAL_MAD
+    spread = float(np.median(np.abs(errors - middle)))
+    kept = np.abs(errors - middle) <= _OUTLIER * spread
     mean = float(errors[kept].mean())
     doubt = float(errors[kept].var(ddof=1)) / int(kept.sum())
-    bias = mean * max(0.0, 1.0 - doubt / max(mean**2, 1e-30))
-    residual = errors - bias
-    typical = max(float(np.median(sigmas)), 1e-9)
-    best, most = _RATIOS[0], -np.inf
-    for ratio in _RATIOS:
-        shape = np.hypot(1.0, ratio * sigmas / typical)[kept]
-        scaled = residual[kept] / shape
-        likelihood = -len(scaled) * np.log(np.sqrt(np.mean(scaled**2))) - np.log(shape).sum()
-        if likelihood > most + 1e-9:
-            best, most = ratio, float(likelihood)
-    scaled = np.sort(np.abs(residual) / np.hypot(1.0, best * sigmas / typical))
-    rank = min(len(scaled), int(np.ceil(COVERAGE * (len(scaled) + 1))))
-    constant = float(scaled[rank - 1])
-    return ErrorModel(bias, constant, constant * best / typical)
+    return mean * max(0.0, 1.0 - doubt / max(mean**2, 1e-30))
+
+
+def _beyond(sizes: Array, known: Array | float) -> Array:
+    """Sizes (n,) of errors without the share that is known, by their squares."""
+    return np.asarray(np.sqrt(np.maximum(sizes**2 - np.square(known), 0.0)))
+
+
+def _conformal(scores: Array) -> float:
+    """Bound that a further score stays below with a probability of 95 %."""
+    rank = min(len(scores), int(np.ceil(COVERAGE * (len(scores) + 1))))
+    return float(np.sort(scores)[rank - 1])
 
 
 @lru_cache(maxsize=1)
@@ -144,18 +193,20 @@ def to_document(
 
 
 def write_shipped(
-    errors: Mapping[Pose, Mapping[str, tuple[Sequence[float], Sequence[float]]]],
+    family: Mapping[Pose, Mapping[str, RowErrors]],
+    unlike: Mapping[Pose, Mapping[str, RowErrors]],
     made_of: Mapping[str, Any],
 ) -> Path:
     """Learn the error models of all rows and write them as the package's data.
 
     Args:
-        errors: by pose and row (`sides_pooled`), the errors of scans and their line sigmas.
-        made_of: split, number of bodies and the model's SHA-256.
+        family: errors by pose and row (`sides_pooled`) on bodies of the model's own family.
+        unlike: the same on bodies unlike it.
+        made_of: splits, numbers of bodies and the model's SHA-256.
     """
     models = {
-        pose: {name: learned(np.array(e), np.array(s)) for name, (e, s) in rows.items()}
-        for pose, rows in errors.items()
+        pose: {name: learned(one, unlike[pose][name]) for name, one in rows.items()}
+        for pose, rows in family.items()
     }
     path = Path(str(resources.files("workers.measure").joinpath(SHIPPED)))
     path.parent.mkdir(exist_ok=True)
@@ -176,7 +227,11 @@ def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
 
 
 def intervals(
-    traces: Sequence[Trace], values: Sequence[float], vertex_sigma_m: Array | None, pose: Pose
+    traces: Sequence[Trace],
+    values: Sequence[float],
+    vertex_sigma_m: Array | None,
+    pose: Pose,
+    scan_errors: ScanErrors,
 ) -> list[tuple[float, float]]:
     """95 % interval of each row.
 
@@ -191,7 +246,8 @@ def intervals(
         model = _model_of(trace, pose)
         if pose == "standard":
             model = replace(model, bias=0.0)
-        found.append(model.interval(value, line_sigma(trace, vertex_sigma_m)))
+        sigma, further = line_sigma(trace, vertex_sigma_m), scan_errors.of(trace.definition)
+        found.append(model.interval(value, sigma, further))
     return found
 
 
@@ -209,5 +265,10 @@ def content_interval(
     """95 % interval of a volume or a surface, whose error is a share of the value."""
     if vertex_sigma_m is None:
         return value, value
-    low, high = shipped()[pose][name].interval(1.0, 0.0)
+    low, high = shipped()[pose][name].interval(1.0, content_sigma(vertex_sigma_m))
     return value * low, value * high
+
+
+def content_sigma(vertex_sigma_m: Array) -> float:
+    """Standard deviation (m) of the surface, rms over all vertices (P,)."""
+    return float(np.sqrt(np.mean(vertex_sigma_m**2)))

@@ -19,6 +19,13 @@ from workers.scape.fit.fit import Method
 @click.option("--cloud", type=click.Path(path_type=Path), help="a point cloud, .ply or .pcd")
 @click.option("--up", type=click.Choice(["z", "y"]), default="z", show_default=True, help="of it")
 @click.option(
+    "--unit",
+    type=click.Choice(["m", "cm", "mm", "in"]),
+    default="m",
+    show_default=True,
+    help="of it",
+)
+@click.option(
     "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="new folder"
 )
 @click.option("--method", type=click.Choice(get_args(Method)), default="joint", show_default=True)
@@ -33,6 +40,7 @@ def fit(
     bundle: Path | None,
     cloud: Path | None,
     up: str,
+    unit: str,
     out_folder: Path,
     method: Method,
     debug_folder: Path | None,
@@ -45,7 +53,7 @@ def fit(
     \b
     Examples:
       reconstruct fit spool/done/20261121T100000Z-7f3a --out result
-      reconstruct fit --cloud body.ply --up y --out result
+      reconstruct fit --cloud body.ply --up y --unit mm --out result
       reconstruct fit BUNDLE --out result --debug pictures
     """
     if (bundle is None) == (cloud is None):
@@ -80,8 +88,9 @@ def fit(
             )
         else:
             assert cloud is not None
+            show("reading", 0.0)
             summary = job.reconstruct_cloud(
-                read_cloud(cloud, up),
+                read_cloud(cloud, up, unit),
                 cloud.stem,
                 temporary,
                 method=method,

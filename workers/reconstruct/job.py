@@ -24,6 +24,7 @@ from workers.export.preview import preview
 from workers.export.result import write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
+from workers.measure.intervals import ScanErrors
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
     Method,
@@ -157,7 +158,8 @@ def _measured(
     """Measurements as scanned, and in the standard standing pose."""
     with watch.step("measure"):
         sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
+        errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m)
         return (
-            measure_body(model, fit.vertices, sigma_m, seen),
-            measure_standing(model, fit.vertices, fit.state, sigma_m, seen),
+            measure_body(model, fit.vertices, sigma_m, seen, errors),
+            measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors),
         )

@@ -23,7 +23,7 @@ from workers.cloud.observed import (
     Preprocessed,
 )
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.crown import crown_rows
+from workers.scape.evidence.crown import crown_rows, crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
 from workers.scape.fit.hands import place_hands
@@ -81,7 +81,9 @@ class FitResult:
     cloud: PointCloud
     """The scan's cloud after the corrections of the cameras."""
     vertex_sigma_m: Array
-    """(P,): posterior standard deviation along the normal."""
+    """(P,): standard deviation along the normal, in excess of an ordinary scan's."""
+    crown_sigma_m: float
+    """Standard deviation of the top of the head, in excess of an ordinary scan's."""
     vertex_seen: NDArray[np.bool_]
     parts: tuple[PartReport, ...]
     verdict: Verdict
@@ -106,6 +108,8 @@ class OverlappingFit:
     reference: Array | None
     """(P, 3): the model's surface in this state; None for the paper's method, whose surface is not
     separated."""
+    crown_sigma_m: float
+    """Standard deviation of the top of the head, in excess of an ordinary scan's."""
     cloud: PointCloud
     correspondences: int
     iterations: int
@@ -187,11 +191,14 @@ def fit_overlapping(
         cloud = cameras.corrected(cloud)
         crown = partial(crown_rows, model, scan.views, cameras.poses(scan.views))
         surface = fit_surface(model, reference, cloud, cameras.corrected(joint.rims), crown)
+    poses = cameras.poses(scan.views)
+    crown_sigma = crown_sigma_m(model, scan.views, poses, surface.vertices, cloud.points)
     return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),
         surface=surface,
         reference=reference,
+        crown_sigma_m=crown_sigma,
         cloud=cloud,
         correspondences=used,
         iterations=iterations,
@@ -227,6 +234,7 @@ def separate_limbs(
         overlapping=fit.vertices,
         cloud=fit.cloud,
         vertex_sigma_m=surface.sigma_m,
+        crown_sigma_m=fit.crown_sigma_m,
         vertex_seen=surface.seen,
         parts=parts,
         verdict=verdict,

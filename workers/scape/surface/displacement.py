@@ -76,7 +76,7 @@ class SurfaceFit:
 
     vertices: Array
     sigma_m: Array
-    """(P,): standard deviation along the normal."""
+    """(P,): standard deviation along the normal, in excess of an ordinary scan's."""
     seen: NDArray[np.bool_]
     """(P,): points lie on the vertex or on a neighbour of it."""
     residual_m: Array
@@ -209,10 +209,9 @@ def _examined(
     on_surface = (used < readings.of_cloud) & (np.abs(away) < _ON_SURFACE_M)
     measured = np.zeros(len(vertices), bool)
     measured[model.faces[places.triangle[on_surface]]] = True
-    prior = offset_prior(model)
     return SurfaceFit(
         vertices=vertices,
-        sigma_m=surface_sigma(prior, seen, after.information, before.residual_m, before.observed),
+        sigma_m=surface_sigma(model, seen, before.residual_m, before.observed),
         seen=seen,
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,

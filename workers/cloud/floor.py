@@ -1,0 +1,121 @@
+"""The floor of a bare cloud, and signs that the cloud is in other units or lies down."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from station.core.errors import InputError
+from workers.cloud.observed import POSSIBLE_HEIGHTS_M
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+_ADULTS_M = (1.2, 2.3)
+"""Statures that tell a unit from the others."""
+_STRAY_SHARE = 0.002
+"""Share of the points at either end of an axis that do not count to its length."""
+_BAND_M = 0.01
+_CELL_M = 0.05
+_FLOOR_M2 = 0.5
+"""Least area of a floor; two feet cover 0.06."""
+_FLOOR_OVER_LEGS = 3.0
+"""Least ratio of its area to that of a band 0.2 m above it."""
+_LEGS_M = 0.2
+_LOWEST_SHARE = 0.3
+"""Share of the cloud's height in which a floor is searched for."""
+_CLEARANCE_M = 0.015
+"""Points so near to the floor are taken away with it: noise of the floor, and soles."""
+_VOXEL_M = 0.04
+_PLANE_ROUNDS = 4
+
+
+def check_units(points: Array, unit: str, up: str) -> None:
+    """Refuse a cloud that is in other units than was said, or lies down.
+
+    Args:
+        points: (n, 3), in metres by the stated unit, z up by the stated axis.
+        unit: one of `UNITS_M`.
+        up: the stated axis.
+
+    Raises:
+        InputError: naming the option that helps.
+    """
+    low, high = np.quantile(points, [_STRAY_SHARE, 1.0 - _STRAY_SHARE], axis=0)
+    *across_m, height_m = high - low
+    least, most = _ADULTS_M
+    if POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
+        return
+    stated = height_m / UNITS_M[unit]
+    for other, scale in UNITS_M.items():
+        if other != unit and least < stated * scale < most:
+            raise InputError(
+                f"the cloud is {stated:.4g} {_UNIT_WORDS[unit]} high, which looks like "
+                f"{_UNIT_WORDS[other]}; use --unit {other}"
+            )
+    length_m = max(across_m)
+    if height_m < least and least < length_m < most:
+        raise InputError(
+            f"the cloud is {length_m:.2f} m long and {height_m:.2f} m high: is it lying down? "
+            f"say which axis points up: --up {'y' if up == 'z' else 'z'}"
+        )
+
+
+def standing_on(points: Array) -> tuple[Mask, float] | None:
+    """Points (n,) of a person who stands on a floor that was scanned too, and the floor's height
+    below them in metres; None where no floor was scanned.
+
+    What stands apart from the person goes with the floor.
+
+    Args:
+        points: (n, 3), metres, z up.
+    """
+    start_m = _floor_band(points)
+    if start_m is None:
+        return None
+    plane = np.array([0.0, 0.0, start_m + 0.5 * _BAND_M])
+    near = np.abs(points[:, 2] - plane[2]) < 2.0 * _BAND_M
+    for _ in range(_PLANE_ROUNDS):
+        basis = np.column_stack([points[near, :2], np.ones(int(near.sum()))])
+        plane = np.linalg.lstsq(basis, points[near, 2], rcond=None)[0]
+        near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _CLEARANCE_M
+    over = points[:, 2] - points[:, :2] @ plane[:2] - plane[2] > _CLEARANCE_M
+    person = np.flatnonzero(over)[_largest_piece(points[over])]
+    kept = np.zeros(len(points), bool)
+    kept[person] = True
+    middle = np.median(points[person, :2], axis=0)
+    return kept, float(middle @ plane[:2] + plane[2])
+
+
+def _floor_band(points: Array) -> float | None:
+    """Lower end of the horizontal band that a floor fills."""
+    low, high = np.quantile(points[:, 2], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
+    bands = np.arange(low - _BAND_M, low + _LOWEST_SHARE * (high - low), _BAND_M)
+    areas = np.array([_area_m2(points, start) for start in bands])
+    best = int(np.argmax(areas))
+    above = _area_m2(points, bands[best] + _LEGS_M)
+    if areas[best] < max(_FLOOR_M2, _FLOOR_OVER_LEGS * above):
+        return None
+    return float(bands[best])
+
+
+def _area_m2(points: Array, start_m: float) -> float:
+    """Area that a horizontal band's points cover."""
+    inside = (points[:, 2] >= start_m) & (points[:, 2] < start_m + _BAND_M)
+    cells = np.unique(np.floor(points[inside, :2] / _CELL_M).astype(np.int64), axis=0)
+    return len(cells) * _CELL_M**2
+
+
+def _largest_piece(points: Array) -> NDArray[np.intp]:
+    """Indices of the largest connected piece of a cloud (n, 3)."""
+    cells = np.floor((points - points.min(axis=0)) / _VOXEL_M).astype(np.int64) + 1
+    shape = tuple(int(size) for size in cells.max(axis=0) + 2)
+    cell = np.ravel_multi_index(tuple(cells.T), shape)
+    occupied = np.zeros(shape, bool)
+    occupied.flat[cell] = True
+    labels, _ = ndimage.label(ndimage.binary_dilation(occupied))
+    label = labels.flat[cell]
+    return np.flatnonzero(label == np.argmax(np.bincount(label)))
