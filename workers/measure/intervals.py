@@ -10,10 +10,10 @@ row's line (`workers.scape.surface.uncertainty`), and `further` is what concerns
 the calibration's own statement of its errors, and a top of the head that nobody saw.
 
 `constant` and the row's systematic error `bias` are learned from scans of held-out bodies of the
-family, `gain` from scans of sculpted bodies by a sensor that errs otherwise than the fit assumes
-(conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), so that an interval contains the
-truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval, since a value is
-the length of its line. In the standard pose, which no camera saw, the bias is the mean error of
+family (conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), `gain` from scans of
+sculpted bodies by a sensor that errs otherwise than the fit assumes, so that an interval contains
+the truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval, since a value
+is the length of its line. In the standard pose, which no camera saw, the bias is the mean error of
 re-posing the body, and it is subtracted from the value.
 """
 
@@ -43,8 +43,8 @@ SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
 _NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval over the standard deviation of a normal distribution."""
-_GAIN_ROUNDS = 3
-"""Rounds in which constant and gain are learned in turn; they settle after two."""
+_LEAST_SIGMA_M = 2e-4
+"""Floor of the sculpted bodies' standard deviation in a row, for its gain."""
 _OUTLIER = 6.0
 """Median absolute deviations beyond which an error does not count to the spread."""
 
@@ -112,18 +112,17 @@ def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
 
     The bias is that of the family, shrunk by its own uncertainty (James & Stein 1961, positive
     part), so that noise of the calibration is not taken for a systematic error. The constant is the
-    conformal quantile of the family's errors, the gain that of the other bodies' errors beyond the
-    constant, over their sigmas.
+    conformal quantile of the family's errors. The gain explains the mean square of the other
+    bodies' errors beyond the family's.
     """
     bias = _shrunk_mean(family.errors)
-    ordinary, strange = np.abs(family.errors - bias), np.abs(unlike.errors - bias)
-    usable = unlike.sigmas > 0.0
-    gain = 0.0
-    for _ in range(_GAIN_ROUNDS):
-        constant = _conformal(_beyond(ordinary, gain * family.sigmas))
-        if usable.any():
-            gain = _conformal(_beyond(strange, constant)[usable] / unlike.sigmas[usable])
-    return ErrorModel(bias, constant, gain)
+    ordinary, strange = np.square(family.errors - bias), np.square(unlike.errors - bias)
+    beyond = float(np.mean(strange)) - float(np.mean(ordinary))
+    strangeness = max(float(np.mean(unlike.sigmas**2)), _LEAST_SIGMA_M**2)
+    gain = float(np.sqrt(max(beyond, 0.0) / strangeness))
+    gain *= _NORMAL_QUANTILE
+    left = np.sqrt(np.maximum(ordinary - np.square(gain * family.sigmas), 0.0))
+    return ErrorModel(bias, float(np.quantile(left, COVERAGE)), gain)
 
 
 def _shrunk_mean(errors: Array) -> float:
@@ -133,17 +132,6 @@ def _shrunk_mean(errors: Array) -> float:
     mean = float(errors[kept].mean())
     doubt = float(errors[kept].var(ddof=1)) / int(kept.sum())
     return mean * max(0.0, 1.0 - doubt / max(mean**2, 1e-30))
-
-
-def _beyond(sizes: Array, known: Array | float) -> Array:
-    """Sizes (n,) of errors without the share that is known, by their squares."""
-    return np.asarray(np.sqrt(np.maximum(sizes**2 - np.square(known), 0.0)))
-
-
-def _conformal(scores: Array) -> float:
-    """Bound that a further score stays below with a probability of 95 %."""
-    rank = min(len(scores), int(np.ceil(COVERAGE * (len(scores) + 1))))
-    return float(np.sort(scores)[rank - 1])
 
 
 @lru_cache(maxsize=1)
