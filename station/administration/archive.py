@@ -15,7 +15,6 @@ from station.administration.booth_file import CONFIG, STATE_FOLDER
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import fsync_folder, private_folder, publish_folder, read_json, write_json
-from station.core.spool import STATES
 from station.sensors.freenect import FreenectCamera
 
 MANIFEST, CONTENT = "backup.json", "content"
@@ -41,10 +40,11 @@ class Part:
 
 def parts(config_path: Path, config: BoothConfig) -> list[Part]:
     """Everything that there is of a booth and makes it this booth."""
-    names = ["booth.toml", "calibration.json", "calibrations"]
+    names = ["booth.toml", "calibration.json", "calibrations", "console"]
     names += [f"spool/{path.name}" for path in _entries(config.spool.folder)]
     if config_path == CONFIG:
         named = {config.calibration, config.calibrate.folder, config.spool.folder}
+        named.add(config.console.folder)
         named |= {
             camera.recording.parent
             for camera in config.cameras
@@ -66,6 +66,7 @@ def part(name: str, config_path: Path, config: BoothConfig) -> Part:
         "booth.toml": config_path,
         "calibration.json": config.calibration,
         "calibrations": config.calibrate.folder,
+        "console": config.console.folder,
     }
     if name in named:
         return Part(name, named[name])
@@ -77,7 +78,7 @@ def part(name: str, config_path: Path, config: BoothConfig) -> Part:
     group, _, rest = name.partition("/")
     if group not in folders or not rest or "/" in rest or rest in (".", ".."):
         raise FormatError(f"no backup has a part {name!r}")
-    return Part(name, folders[group] / rest, personal=group == "spool" and rest in STATES)
+    return Part(name, folders[group] / rest, personal=group == "spool")
 
 
 def _entries(folder: Path) -> list[Path]:

@@ -24,6 +24,7 @@ _ENVIRONMENT = (
     "DEBIAN_FRONTEND=noninteractive",
 )
 _BOOT_S = 60.0
+_COMMAND_S = 900.0
 # systemd wants the unified hierarchy for itself; a host with the old one has it as well, but
 # elsewhere, and nspawn looks in one place.
 _IN_OWN_CGROUP = """
@@ -116,7 +117,7 @@ class Machine:
     def run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run a command as root on it."""
         done = subprocess.run(
-            self._inside(words), capture_output=True, text=True, timeout=240, check=False
+            self._inside(words), capture_output=True, text=True, timeout=_COMMAND_S, check=False
         )
         if check and done.returncode:
             raise AssertionError(

@@ -57,7 +57,7 @@ def _is_back(machine: Machine, unit: str, restarts: int) -> bool:
 
 def _scan(machine: Machine, label: str) -> str:
     """Scan and wait for the result; returns the scan's id."""
-    done = machine.run("station", "scan", "--label", label, check=False)
+    done = machine.run("station", "scan", "--label", label, "--timeout", "600", check=False)
     assert done.returncode in _DELIVERED, done.stdout + done.stderr
     found = re.search(r"^scan (\S+)", done.stdout, re.MULTILINE)
     assert found, done.stdout

@@ -107,7 +107,8 @@ def booth(tmp_path: Path) -> Path:
     for name in ("calibrations/20261122/ball.npz", "spool/outbox/scan-1/mesh.ply", "spool/tmp/x"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(name.encode())
-    (folder / "spool/audit.jsonl").write_text("{}\n")
+    (folder / "console").mkdir()
+    (folder / "console/audit.jsonl").write_text("{}\n")
     return folder / "booth.toml"
 
 
@@ -145,13 +146,13 @@ def test_restoring_keeps_what_it_replaces(booth: Path, tmp_path: Path) -> None:
 
 def test_a_database_is_saved_while_it_is_written(booth: Path, tmp_path: Path) -> None:
     """The rows since the last checkpoint are in a journal beside it: copies of files lack them."""
-    with closing(sqlite3.connect(booth.parent / "spool/tokens.sqlite")) as live:
+    with closing(sqlite3.connect(booth.parent / "console/console.sqlite")) as live:
         live.execute("PRAGMA journal_mode = WAL")
         live.execute("CREATE TABLE token (name TEXT)")
         live.execute("INSERT INTO token VALUES ('till')")
         live.commit()
         saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
-    copy = saved / "content/spool/tokens.sqlite"
+    copy = saved / "content/console/console.sqlite"
     with closing(sqlite3.connect(copy)) as restored:
         assert restored.execute("SELECT name FROM token").fetchall() == [("till",)]
 
@@ -192,7 +193,7 @@ def test_every_file_of_a_booth_belongs_to_a_part(booth: Path) -> None:
         "calibration.json",
         "calibrations",
         "spool/outbox",
-        "spool/audit.jsonl",
+        "console",
     }
 
 
