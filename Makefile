@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DEMO := demo
 BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
-.PHONY: help demo test check format train evaluate-model intervals lock package test-install clean \
+.PHONY: help demo test test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
 
 help:
@@ -15,6 +15,8 @@ help:
 	@echo "make train    learn the body model anew (minutes)"
 	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
 	@echo "make intervals  calibrate the measurements' intervals anew, after any change to model or fit"
+	@echo "make test-faults   kill, stop, starve and fuzz the station: the short form of the table (a minute)"
+	@echo "make soak     the long form, then scans for hours; ARGS=\"--minutes 600\""
 	@echo "make package  the Debian packages, wheel and source distribution of this commit, in dist/"
 	@echo "make test-install   install them on a fresh Debian under systemd and put them to the test (root)"
 	@echo "make lock     pin the packages' dependencies anew"
@@ -25,6 +27,12 @@ demo: $(VENV)/runtime.stamp
 
 test: $(VENV)/train.stamp
 	$(BIN)/python -m pytest --durations=20
+
+test-faults: $(VENV)/dev.stamp
+	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py $(ARGS)
+
+soak: $(VENV)/dev.stamp
+	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long --minutes 60 $(ARGS)
 
 check: $(VENV)/train.stamp
 	$(BIN)/ruff check .
