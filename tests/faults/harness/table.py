@@ -14,7 +14,7 @@ class Row:
     seen: str
     met: bool
     timed: bool = False
-    """A limit in seconds: on a busy machine a miss says little, so only the long form ends with 1."""
+    """A limit in seconds: a busy machine misses it, so only the long form ends with 1."""
 
     def __str__(self) -> str:
         return (
