@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from running_station import Station
 
-from station.core.errors import DriverError
+from station.core.errors import BoothError, DriverError
+from station.core.files import held
 from station.core.spool import Spool
 from station.sensors.freenect import LIBRARY_VARIABLE, FreenectCamera, FreenectDriver
 from station.sensors.registry import make_driver
@@ -119,3 +120,32 @@ def test_one_station_to_a_runtime_folder(make_station: Callable[..., Station]) -
     )  # fmt: skip
     assert second.returncode == 1
     assert "a station runs already" in second.stderr
+
+
+@pytest.mark.parametrize("process", ["control", "sync"])
+def test_one_process_of_a_kind_to_a_runtime_folder(tmp_path: Path, process: str) -> None:
+    """A second control took the first one's socket away, and left the booth deaf when it ended."""
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    with held(tmp_path / f"run/{process}.lock", BoothError("busy")):
+        second = subprocess.run(
+            [*STATION, process, "--config", str(config)],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert second.returncode == 1
+    assert "runs already here" in second.stderr
+
+
+@pytest.mark.parametrize("scan_id", ["../../escape", "a\nb", "x" * 65, "\x1b[2J"])
+def test_a_strange_scan_id_is_refused_at_the_door(tmp_path: Path, scan_id: str) -> None:
+    """A person's bundle was written outside the spool, where no purge finds it."""
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    for command in (["scan", "--scan-id"], ["purge"], ["retry"]):
+        done = subprocess.run(
+            [*STATION, *command, scan_id, "--config", str(config)],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 1
+        assert "no scan id" in done.stderr
+        assert "\x1b" not in done.stderr

@@ -40,9 +40,9 @@ class Outcome:
 class JobProcess:
     """One warmed-up process for one job."""
 
-    def __init__(self) -> None:
+    def __init__(self, module: str = "workers.reconstruct.job_process") -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "workers.reconstruct.job_process", str(os.getpid())],
+            [sys.executable, "-m", module, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

@@ -1,0 +1,66 @@
+"""Jobs that crash, hang, starve or compute nonsense: who is to blame, and what is said."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from station.core.config import BoothConfig
+from station.sensors.recorded import RecordedCamera
+from workers.reconstruct.order import JobProcess, Outcome
+
+_MODULE = """
+import os, signal
+from pathlib import Path
+import numpy as np
+import workers.reconstruct.job as job
+from workers.reconstruct.job_process import main
+
+def reconstruct(bundle, out, progress, **_):
+    progress("loading", 0.0)
+    {act}
+    return job.JobSummary("ok", ())
+
+job.warm_up = lambda: None
+job.reconstruct_bundle = reconstruct
+main()
+"""
+
+
+def _outcome(folder: Path, monkeypatch: pytest.MonkeyPatch, act: str) -> Outcome:
+    (folder / "spoilt_job.py").write_text(_MODULE.format(act=act))
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    camera = RecordedCamera(name="a", recording=Path("a"))
+    process = JobProcess("spoilt_job")
+    begun = threading.Event()
+    process.send(folder, folder, BoothConfig(cameras=(camera,)))
+    timeout_s = 5.0 if "while" in act else 100.0
+    outcome = process.outcome(timeout_s, threading.Event(), begun.set)
+    process.kill()
+    return outcome
+
+
+@pytest.mark.parametrize(
+    ("act", "blame", "words"),
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "job", "by SIGSEGV"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", "station", "by SIGKILL"),
+        ("os._exit(7)", "job", "with code 7"),
+        ("while True: pass", "job", "hung for 5 s"),
+        ("np.ones(10 << 27)", "job", "more than 2048 MB"),
+        ("raise OSError(28, 'No space left on device')", "disk", "No space left"),
+        ("raise ValueError('Out of range float values: nan')", "job", "ValueError"),
+    ],
+)
+def test_an_end_without_a_result_has_a_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: str, blame: str, words: str
+) -> None:
+    outcome = _outcome(tmp_path, monkeypatch, act)
+    assert (outcome.blame, outcome.status) == (blame, "")
+    assert words in outcome.reason
+
+
+def test_a_sound_job_has_its_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _outcome(tmp_path, monkeypatch, "pass") == Outcome(status="ok")
