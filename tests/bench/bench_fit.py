@@ -35,6 +35,7 @@ from fit_cases import (
     other_cases,
     rig_cases,
     sampled,
+    unlike_cases,
 )
 from fit_pictures import write_error_picture
 from fit_report import (
@@ -49,6 +50,7 @@ from fit_report import (
 )
 from numpy.typing import NDArray
 from surface_errors import surface_errors
+from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
 from station.core.config import Volume
@@ -93,7 +95,10 @@ def _folder(case: Case, folder: Path) -> Path:
 
 
 def _render(case: Case, folder: Path) -> None:
-    render_bundle(case.body, _folder(case, folder), case.booth)
+    if case.sensor is None or case.body is None:
+        render_bundle(case.body, _folder(case, folder), case.booth)
+    else:
+        render_unlike(case.body, _folder(case, folder), case.booth, case.sensor)
 
 
 def render_all(cases: Sequence[Case], folder: Path) -> None:
@@ -120,7 +125,7 @@ def fitted(case: Case, model: BodyModel, folder: Path) -> tuple[Row, Preprocesse
     start_s = time.perf_counter()
     fit = fit_body(model, scan)
     fit_s = time.perf_counter() - start_s
-    errors = surface_errors(model, fit.vertices, fit.vertex_seen, case.body)
+    errors = surface_errors(model, fit.vertices, fit.vertex_seen, case.body, fit.cloud.points)
     return Row(case, fit, errors, fit_s, whole_s), scan
 
 
@@ -255,15 +260,19 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--bodies", type=int, default=30, help="of the training family, 1 to 30")
+    parser.add_argument("--unlike", type=int, default=20, help="sculpted test bodies, at most 40")
     parser.add_argument("--peers", type=int, default=2, help="cases to run the other methods on")
     parser.add_argument("--other-bodies", type=Path, help="folder of .npz of other families")
-    parser.add_argument("--only", nargs="+", metavar="GROUP", help="family, other, hard, rig, bad")
+    parser.add_argument(
+        "--only", nargs="+", metavar="GROUP", help="family, unlike, other, hard, rig, bad"
+    )
     parser.add_argument("--pictures", type=Path, help="draw each group's worst case into a folder")
     arguments = parser.parse_args()
     model = warm_up()
     bodies = TestBodies()
     first = bodies.body(0)
     cases = [*family_cases(bodies, max(1, arguments.bodies))]
+    cases += unlike_cases(model, arguments.unlike)
     if arguments.other_bodies:
         cases += other_cases(arguments.other_bodies)
     cases += [*hard_cases(bodies), *rig_cases(first), *bad_cases(first)]

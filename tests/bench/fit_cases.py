@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from unlike_bodies import UnlikeBodies
+from unlike_sensor import UnlikeSensor
 
 from station.core.geometry import rigid, so3_exp
 from station.core.rig import Rig
@@ -18,10 +20,11 @@ from station.simulation.scene import Mesh, box, chair, default_rig, look_at
 from station.simulation.sensor import SimulatedBooth
 from workers.cloud.observed import PointCloud
 from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
+from workers.scape.model.body_model import BodyModel
 from workers.scape.surface.intersections import self_intersections
 
 Array = NDArray[np.float64]
-Group = Literal["family", "other", "hard", "rig", "bad"]
+Group = Literal["family", "unlike", "other", "hard", "rig", "bad"]
 
 _POOL = 30
 _SEED = 11
@@ -38,6 +41,8 @@ class Case:
     name: str
     body: Mesh | None
     booth: SimulatedBooth
+    sensor: UnlikeSensor | None = None
+    """None for the usual one."""
 
 
 class TestBodies:
@@ -110,6 +115,13 @@ def family_cases(bodies: TestBodies, count: int) -> Iterator[Case]:
     for index in range(min(count, _POOL)):
         booth = SimulatedBooth(seed=index, sway_m=0.0)
         yield Case("family", f"test {index:02d}", bodies.body(index), booth)
+
+
+def unlike_cases(model: BodyModel, count: int) -> Iterator[Case]:
+    """Sculpted test bodies before sensors that err otherwise than the fit assumes, at most 40."""
+    for index, body in enumerate(UnlikeBodies(model, "test").bodies(count)):
+        booth = SimulatedBooth(seed=7000 + index)
+        yield Case("unlike", f"test {index:02d}", body.mesh, booth, UnlikeSensor())
 
 
 def other_cases(folder: Path) -> Iterator[Case]:

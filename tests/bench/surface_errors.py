@@ -16,6 +16,10 @@ from workers.scape.model.deformation import vertex_areas
 Array = NDArray[np.float64]
 
 _EXTREMITIES = ("hand", "foot")
+_SEEN_M = 0.008
+"""A place of the true surface as near to a point of the cloud counts as seen."""
+_EXPLAINED_M = 0.004
+_PLACES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +33,12 @@ class SurfaceErrors:
     seen_median: float
     """Trunk, limbs and head where a camera saw the surface."""
     seen_extremity_median: float
+    seen_rms: float
+    """Trunk, limbs and head within 8 mm of a point of the cloud ..."""
+    unseen_rms: float
+    """... and beyond."""
+    unexplained: float
+    """Per cent of the cloud whose true places lie more than 4 mm from the result."""
     height: float
     """Signed."""
     by_part: dict[str, float]
@@ -49,8 +59,23 @@ def distances_m(vertices: Array, faces: NDArray[np.int32], points: Array) -> Arr
     return np.asarray(found.numpy(), np.float64)
 
 
+def _nearest_places(truth: Mesh, points: Array) -> Array:
+    """(n, 3): places of a true surface next to points."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(truth.vertices.astype(np.float32)),
+        o3d.core.Tensor(truth.faces.astype(np.uint32)),
+    )
+    found = scene.compute_closest_points(o3d.core.Tensor(points.astype(np.float32)))
+    return np.asarray(found["points"].numpy(), np.float64)
+
+
 def surface_errors(
-    model: BodyModel, vertices: Array, seen: NDArray[np.bool_] | None, truth: Mesh
+    model: BodyModel,
+    vertices: Array,
+    seen: NDArray[np.bool_] | None,
+    truth: Mesh,
+    points: Array | None = None,
 ) -> SurfaceErrors:
     """Compare a result's vertices (P, 3), of which some were seen (P,), with the true surface."""
     away = 1e3 * distances_m(vertices, model.faces, truth.vertices)
@@ -64,11 +89,21 @@ def surface_errors(
         names, _EXTREMITIES[1]
     )
     visible = np.ones(len(away), bool) if seen is None else seen[nearest]
+    near, unexplained = np.ones(len(away), bool), float("nan")
+    if points is not None:
+        near = cKDTree(points).query(truth.vertices)[0] < _SEEN_M
+        places = _nearest_places(truth, points[:: max(1, len(points) // _PLACES)])
+        unexplained = 100.0 * float(
+            np.mean(distances_m(vertices, model.faces, places) > _EXPLAINED_M)
+        )
     return SurfaceErrors(
         body_rms=_rms(away, area, ~extremity),
         extremity_rms=_rms(away, area, extremity),
         seen_median=_median(away, area, ~extremity & visible),
         seen_extremity_median=_median(away, area, extremity & visible),
+        seen_rms=_rms(away, area, ~extremity & near),
+        unseen_rms=_rms(away, area, ~extremity & ~near),
+        unexplained=unexplained,
         height=1e3 * float(np.ptp(vertices[:, 2]) - np.ptp(truth.vertices[:, 2])),
         by_part={str(name): _rms(away, area, names == name) for name in np.unique(names)},
     )
@@ -80,6 +115,8 @@ def _operators_name(part: str) -> str:
 
 
 def _rms(away: Array, area: Array, chosen: NDArray[np.bool_]) -> float:
+    if not chosen.any():
+        return float("nan")
     return float(np.sqrt(np.average(np.square(away[chosen]), weights=area[chosen])))
 
 
