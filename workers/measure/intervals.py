@@ -29,6 +29,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from station.core.errors import FormatError
 from workers.measure.kinds import Definition, Top
@@ -43,6 +44,9 @@ SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
 _NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval over the standard deviation of a normal distribution."""
+_LEAST_CONSTANT = 0.7
+"""Floor of the constant, as a share of what it is without the family's own sigmas: an ordinary scan
+with none of them is no better than that."""
 _LEAST_SIGMA_M = 2e-4
 """Floor of the sculpted bodies' standard deviation in a row, for its gain."""
 _OUTLIER = 6.0
@@ -113,16 +117,20 @@ def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
     The bias is that of the family, shrunk by its own uncertainty (James & Stein 1961, positive
     part), so that noise of the calibration is not taken for a systematic error. The constant is the
     conformal quantile of the family's errors. The gain explains the mean square of the other
-    bodies' errors beyond the family's.
+    bodies' errors beyond the family's, by Student's t for their number.
     """
     bias = _shrunk_mean(family.errors)
     ordinary, strange = np.square(family.errors - bias), np.square(unlike.errors - bias)
     beyond = float(np.mean(strange)) - float(np.mean(ordinary))
     strangeness = max(float(np.mean(unlike.sigmas**2)), _LEAST_SIGMA_M**2)
     gain = float(np.sqrt(max(beyond, 0.0) / strangeness))
-    gain *= _NORMAL_QUANTILE
+    gain *= float(stdtrit(len(unlike.errors) - 1, 0.5 + 0.5 * COVERAGE))
     left = np.sqrt(np.maximum(ordinary - np.square(gain * family.sigmas), 0.0))
-    return ErrorModel(bias, float(np.quantile(left, COVERAGE)), gain)
+    constant = max(
+        float(np.quantile(left, COVERAGE)),
+        _LEAST_CONSTANT * float(np.quantile(np.sqrt(ordinary), COVERAGE)),
+    )
+    return ErrorModel(bias, constant, gain)
 
 
 def _shrunk_mean(errors: Array) -> float:
