@@ -36,7 +36,8 @@ def main() -> None:
         command = [*STATION, "record-virtual", *options, "--driver", arguments.driver]
         subprocess.run(command, check=True, capture_output=True)
         config = folder / "booth.toml"
-        config.write_text(config.read_text() + "\n[workers]\ncount = 0\n")
+        extra = "\n[workers]\ncount = 0\n[console]\nenabled = false\n"
+        config.write_text(config.read_text() + extra)
         environment = {**os.environ, "BOOTH_CONFIG": str(config)}
         station = subprocess.Popen([*STATION, "run"], env=environment)
         try:
@@ -52,12 +53,13 @@ def main() -> None:
 def measure(pid: int, environment: dict[str, str], seconds: float) -> None:
     """Print the table of one run."""
     children = psutil.Process(pid).children(recursive=True)
-    before, start_s = status(environment), time.monotonic()
-    used_before = cpu_seconds(children)
+    before = status(environment)
+    used_before, start_s = cpu_seconds(children), time.monotonic()
     time.sleep(seconds)
-    used = cpu_seconds(children)
-    after, elapsed_s = status(environment), time.monotonic() - start_s
-    sets = (after["framesets"] - before["framesets"]) / elapsed_s
+    used, elapsed_s = cpu_seconds(children), time.monotonic() - start_s
+    after = status(environment)
+    # Counted from when sync said so to when it said so again.
+    sets = (after["framesets"] - before["framesets"]) / (after["told_s"] - before["told_s"])
     lost = sum(camera["lost"] for camera in after["cameras"].values())
     frames = sum(
         after["cameras"][name]["frames"] - before["cameras"][name]["frames"]

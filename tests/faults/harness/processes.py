@@ -235,9 +235,11 @@ def _until(true: Callable[[], bool]) -> None:
 
 def make_booth(folder: Path, station_command: tuple[str, ...], body: Path) -> Path:
     """Record a virtual booth into a folder; returns its configuration."""
-    options = ("--body", str(body), "--out", str(folder), "--frames", "12", "--passes", "2000")
+    options = ("--body", str(body), "--out", str(folder), "--frames", "12", "--passes", "600")
     subprocess.run(
         [*station_command, "record-virtual", *options, "--driver", "recorded"],
         check=True, capture_output=True,
     )  # fmt: skip
-    return folder / "booth.toml"
+    config = folder / "booth.toml"
+    config.write_text(f"{config.read_text()}\n[console]\nenabled = false\n")
+    return config
