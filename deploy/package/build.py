@@ -104,7 +104,8 @@ def build_booth(commit: Commit, source: Path, wheel: Path, tree: Path, out: Path
     root = tree.with_suffix(".image")
     site = root / SITE
     _install(source / "deploy/lock/booth.txt", site)
-    _install(None, site, str(wheel))
+    # pip would note the path that it came from.
+    shutil.unpack_archive(wheel, site, "zip")
     (site / "booth-simulation.pth").write_text(f"{MOUNTED[SIMULATION]}\n")
     _slim(site)
     _virtual_environment(root)
@@ -156,16 +157,14 @@ def _export(commit: Commit, folder: Path) -> Path:
     return folder
 
 
-def _install(lock: Path | None, target: Path, *names: str) -> None:
-    """Install exactly what a lock file says, or a local wheel, without running anything of it."""
+def _install(lock: Path, target: Path) -> None:
+    """Install exactly what a lock file says, without running anything of it."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     command += ["--no-deps", "--no-compile", "--target", str(target), "--upgrade"]
-    command += ["--require-hashes", "-r", str(lock)] if lock else ["--no-index", *names]
+    command += ["--require-hashes", "-r", str(lock)]
     subprocess.run([*command, "--only-binary", ":all:"], check=True, stderr=_quiet())
-    # Programs of the dependencies, and notes on where pip found things, stay out.
+    # Programs of the dependencies stay out.
     shutil.rmtree(target / "bin", ignore_errors=True)
-    for note in [*target.glob("*.dist-info/direct_url.json"), *target.glob("*/REQUESTED")]:
-        note.unlink()
 
 
 def _quiet() -> int | None:
