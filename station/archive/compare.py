@@ -37,7 +37,7 @@ class SurfaceDifference:
 def compare_rows(
     first: Path, second: Path, pose: Pose, unit: Unit, language: Language
 ) -> list[dict[str, Any]]:
-    """Each measurement of both results, second less first.
+    """Each measurement that both results have, second less first.
 
     A difference counts as real where it exceeds what both 95 % intervals explain together
     (the root of the sum of their half-widths' squares).
@@ -46,7 +46,11 @@ def compare_rows(
         FormatError: a table is missing or damaged.
     """
     ours, theirs = (
-        {row["name"]: row for row in read_measurements(folder, pose)["measurements"]}
+        {
+            row["name"]: row
+            for row in read_measurements(folder, pose)["measurements"]
+            if row["value_m"] is not None
+        }
         for folder in (first, second)
     )
     scale, digits = PER_METRE[unit], DIGITS[unit]

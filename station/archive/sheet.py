@@ -60,8 +60,8 @@ class _Entry:
     number: int
     words: str
     names: tuple[str, ...]
-    values: tuple[tuple[str, float, float], ...]
-    """(side, value, half of the interval)."""
+    values: tuple[tuple[str, float | None, float], ...]
+    """(side, value, half of the interval); no value where the part is missing in the scan."""
 
 
 def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: Language) -> bytes:
@@ -95,10 +95,14 @@ def _entries(table: Sequence[dict[str, Any]]) -> list[_Entry]:
             number,
             words,
             tuple(row["name"] for row in group),
-            tuple((row["side"], row["value"], (row["high"] - row["low"]) / 2) for row in group),
+            tuple((row["side"], row["value"], _half(row)) for row in group),
         )
         for number, (words, group) in enumerate(grouped.items(), start=1)
     ]
+
+
+def _half(row: dict[str, Any]) -> float:
+    return 0.0 if row["value"] is None else (row["high"] - row["low"]) / 2
 
 
 def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: Language) -> None:
@@ -240,6 +244,9 @@ def _table(canvas: Canvas, entries: Sequence[_Entry], unit: Unit, language: Lang
             _text(canvas, left + 15, y, entry.words, 7.6, _INK)
             for side, value, around in entry.values:
                 right = left + width - (2 if side == "right" else 92)
+                if value is None:
+                    _text(canvas, right - 28 - _width("–", 8.2, True), y, "–", 8.2, _GREY, True)
+                    continue
                 about = f"± {around:.{digits}f}"
                 _text(canvas, right - _width(about, 6.2), y, about, 6.2, _GREY)
                 text = f"{value:.{digits}f}"

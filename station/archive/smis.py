@@ -15,7 +15,7 @@ _NO_BIRTHDAY = "1800-01-01"
 
 
 def smis(scan: ScanRecord, document: dict[str, Any]) -> bytes:
-    """The file: centimetres, one entry for each measurement.
+    """The file: centimetres, one entry for each measurement that has a value.
 
     SeamlyMe's names have no sides. As ISO 8559-1 measures the right side, its own names take the
     right one; the left one, and what SeamlyMe does not know, becomes a custom measurement, whose
@@ -32,6 +32,8 @@ def smis(scan: ScanRecord, document: dict[str, Any]) -> bytes:
         ElementTree.SubElement(person, name).text = _legal(text)
     body = ElementTree.SubElement(root, "body-measurements")
     for row in document["measurements"]:
+        if row["value_m"] is None:
+            continue
         attributes = {"name": seamly_name(row["name"]), "value": f"{100 * row['value_m']:.2f}"}
         if attributes["name"].startswith("@"):
             attributes["full_name"] = plain_name(row["name"])

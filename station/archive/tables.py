@@ -23,8 +23,9 @@ DIGITS: dict[Unit, int] = {"m": 4, "cm": 1, "in": 2}
 """A tenth of a millimetre, a millimetre, a quarter of one: finer than any interval."""
 _HEADS = {
     "en": ("order", "date", "verdict", "pose", "measurement", "side", "value", "low", "high",
-           "unit", "standard"),
-    "zh": ("订单", "日期", "结论", "姿势", "尺寸", "左右", "数值", "下限", "上限", "单位", "标准"),
+           "unit", "basis", "standard"),
+    "zh": ("订单", "日期", "结论", "姿势", "尺寸", "左右", "数值", "下限", "上限",
+           "单位", "依据", "标准"),
 }  # fmt: skip
 _WORDS = {
     "en": {"ok": "ok", "rescan": "scan again", "as-scanned": "as scanned", "standard": "standard",
@@ -60,11 +61,12 @@ def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[
 
 
 def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any]:
-    name, (low_m, high_m) = str(entry["name"]), entry["interval95_m"]
-    value, low, high = (
-        round(PER_METRE[unit] * length, DIGITS[unit])
-        for length in (entry["value_m"], low_m, high_m)
-    )
+    name = str(entry["name"])
+    # A part that is missing in the scan has rows without values.
+    known = entry["value_m"] is not None
+    lengths_m = (entry["value_m"], *entry["interval95_m"]) if known else ()
+    scaled = [round(PER_METRE[unit] * length, DIGITS[unit]) for length in lengths_m]
+    value, low, high = scaled if known else (None, None, None)
     return {
         "name": name,
         "words": plain_name(name, language, with_side=False),
@@ -72,6 +74,7 @@ def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any
         "value": value,
         "low": low,
         "high": high,
+        "basis": entry.get("basis") or "",
         "standard": str(entry.get("standard", "")),
     }
 
@@ -89,8 +92,8 @@ def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: 
     for row in rows(document, unit, language):
         side = words.get(row["side"], "")
         texts = (scan.label or scan.scan_id, scan.created, verdict, pose, row["words"], side)
-        numbers = (row["value"], row["low"], row["high"], unit, row["standard"])
-        writer.writerow([*map(_harmless, texts), *numbers])
+        numbers = ("" if row[key] is None else row[key] for key in ("value", "low", "high"))
+        writer.writerow([*map(_harmless, texts), *numbers, unit, row["basis"], row["standard"]])
     return "\ufeff" + stream.getvalue()
 
 

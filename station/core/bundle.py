@@ -213,11 +213,13 @@ def write_bundle(
     rig: Rig,
     frames: Mapping[str, Sequence[CapturedFrame]],
     spread_s_max: float,
+    booth: str = "",
 ) -> None:
     """Write a bundle's files into a new folder; publishing it under its final name is the caller's.
 
     Args:
         frames: per camera, in order of time.
+        booth: name of the booth.
 
     Raises:
         FileExistsError: the folder is there already.
@@ -234,6 +236,7 @@ def write_bundle(
             "scan_id": scan_id,
             "created": created,
             "label": label,
+            "booth": booth,
             "depth_scale_m": depth_scale_m,
             "cameras": cameras,
             "sync": {"spread_s_max": spread_s_max},

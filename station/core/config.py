@@ -185,6 +185,7 @@ class BoothConfig(Strict):
     """A whole booth."""
 
     version: Literal[1] = 1
+    name: str = Field(default="", max_length=60, description="the booth's name, in every result")
     cameras: tuple[SerializeAsAny[CameraConfig], ...] = Field(min_length=1)
     calibration: ConfigPath = Path("calibration.json")
     volume: Volume = _section()

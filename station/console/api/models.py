@@ -136,9 +136,12 @@ class Row(BaseModel):
     name: str
     words: str
     side: Literal["", "left", "right"]
-    value: float
-    low: float = Field(description="lower end of the 95 % interval")
-    high: float
+    value: float | None = Field(description="null where the part is missing in the scan")
+    low: float | None = Field(description="lower end of the 95 % interval")
+    high: float | None
+    basis: Literal["", "seen", "partly", "inferred"] = Field(
+        description="whether cameras saw what was measured"
+    )
     standard: str
 
 

@@ -48,9 +48,10 @@ _MEANINGS = {
     421: "The console does not go by this name",
     422: "A value is missing or impossible",
     429: "Too many wrong passwords; Retry-After says how long to wait",
+    431: "The headers are too large",
     503: "No station answers",
 }
-_ALWAYS = (401, 403, 408, 413, 421, 422, 503)
+_ALWAYS = (401, 403, 408, 413, 421, 422, 431, 503)
 
 
 def responses(*more: int) -> dict[int | str, dict[str, Any]]:

@@ -91,11 +91,15 @@ def _state(console: Console, scan_id: str) -> Scan:
     if record is not None:
         return of_record(record)
     try:
-        return _of_session(command(console.config, Request("scan-status", scan_id)))
+        found = _of_session(command(console.config, Request("scan-status", scan_id)))
     except RefusedError as error:
         raise ProblemError(404, "no-such-scan", str(error)) from None
     except NotRunningError:
         raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
+    if found.state not in _ON_DISK:
+        return found
+    # On disk by now, or deleted: the station remembers what it did, the folders what there is.
+    return of_record(console.record(scan_id))
 
 
 @router.post("/{scan_id}/cancel", responses=responses(404, 409))

@@ -17,6 +17,7 @@ App = Callable[[Message, Receive, Send], Awaitable[None]]
 
 LARGEST_BODY_BYTES = 64 << 10
 """Labels and passwords are all that is ever sent here."""
+LARGEST_HEAD_BYTES = 16 << 10
 SLOWEST_BODY_S = 10.0
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _POLICY = (
@@ -96,6 +97,8 @@ class Gate:
             return 403, "cross-site", "this request was sent by a page of another site"
         if scope["type"] == "websocket" and origin is None and "authorization" not in headers:
             return 403, "cross-site", "a WebSocket needs an Origin, or a token"
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > LARGEST_HEAD_BYTES:
+            return 431, "head-too-large", f"at most {LARGEST_HEAD_BYTES} bytes of headers are taken"
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit() or int(length) > LARGEST_BODY_BYTES:
             return 413, *_TOO_LARGE

@@ -39,8 +39,9 @@ export async function result(main, session, scanId) {
       return h('tr', { 'data-name': row.name, 'data-words': name, tabIndex: 0, 'aria-selected': 'false', onclick: () => pick(row.name),
         onkeydown: (event) => { if (['Enter', ' '].includes(event.key)) { event.preventDefault(); pick(row.name); } } },
         h('td', {}, name),
-        h('td', { className: 'number' }, h('b', {}, row.value.toFixed(digits()))),
-        h('td', { className: 'number interval' }, `${row.low.toFixed(digits())} – ${row.high.toFixed(digits())}`));
+        h('td', { className: 'number' }, h('b', {}, row.value === null ? '–' : row.value.toFixed(digits()))),
+        h('td', { className: 'number interval' }, row.value === null ? t('result.missing') : `${row.low.toFixed(digits())} – ${row.high.toFixed(digits())}`,
+          ['partly', 'inferred'].includes(row.basis) ? h('div', {}, t(`result.${row.basis}`)) : null));
     }));
     pick(chosen, false);
     links();

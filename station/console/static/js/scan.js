@@ -25,6 +25,7 @@ export async function scan(main, session) {
   let current = null;
   let pressed = 0;
   let timer = null;
+  let parts = null;
 
   function ready() {
     current = null;
@@ -63,6 +64,7 @@ export async function scan(main, session) {
 
   function follow(found) {
     current = found;
+    parts = null;
     clearInterval(timer);
     // Events tell sooner; asking now and then bridges a lost connection.
     timer = setInterval(ask, POLL_MS);
@@ -85,28 +87,35 @@ export async function scan(main, session) {
     if (FINAL.includes(current.state) && !FINAL.includes(before)) finish();
   }
 
-  function ring(share, content, busy = false) {
+  // Built once for a scan and then kept up to date: a button must not vanish under a finger.
+  function taking() {
     const circle = { cx: 116, cy: 116, r: 108 };
-    return h('div', { className: busy ? 'ring busy' : 'ring' },
-      s('svg', { viewBox: '0 0 232 232', 'aria-hidden': 'true' }, s('circle', circle),
-        s('circle', { ...circle, class: 'done', 'stroke-dasharray': AROUND, 'stroke-dashoffset': AROUND * (1 - share) })),
-      content);
+    const done = s('circle', { ...circle, class: 'done', 'stroke-dasharray': AROUND, 'stroke-dashoffset': AROUND });
+    const word = h('span', { className: 'word' });
+    const ring = h('div', { className: 'ring' },
+      s('svg', { viewBox: '0 0 232 232', 'aria-hidden': 'true' }, s('circle', circle), done), word);
+    const leave = h('p', { className: 'leave', id: 'leave', hidden: true }, t('scan.leave'));
+    const below = h('p', {}, t('scan.countdown'));
+    const give = h('button', { id: 'give-up', onclick: giveUp }, t('scan.give'));
+    stage.replaceChildren(h('h2', {}, current.label || t('result.noLabel')), leave, ring, below, give);
+    parts = { done, word, ring, leave, below, give };
   }
 
   function show({ left_s: left } = {}) {
-    const name = h('h2', {}, current.label || t('result.noLabel'));
-    const give = h('button', { id: 'give-up', onclick: giveUp }, t('scan.give'));
-    const leave = h('p', { className: 'leave', id: 'leave' }, t('scan.leave'));
-    if (current.state === 'countdown' || current.state === 'armed') {
-      stage.replaceChildren(name, ring(left ? left / Math.max(1, session.countdown_s) : 0,
-        h('span', { className: 'number' }, String(left || '…'))), h('p', {}, t('scan.countdown')), give);
-    } else if (current.state === 'capturing') {
-      stage.replaceChildren(name, ring(current.framesets / Math.max(1, current.wanted),
-        h('span', { className: 'word' }, t('scan.hold'))), give);
-    } else if (current.state === 'accepted' || current.state === 'reconstructing') {
-      const words = t(current.state === 'accepted' ? 'scan.waiting' : 'scan.working');
-      stage.replaceChildren(name, leave, ring(0.3, h('span', { className: 'word' }, words), true));
-    }
+    if (!parts) taking();
+    const { done, word, ring, leave, below, give } = parts;
+    const free = current.state === 'accepted' || current.state === 'reconstructing';
+    const counting = current.state === 'countdown' || current.state === 'armed';
+    const share = counting ? (left || 0) / Math.max(1, session.countdown_s)
+      : free ? 0.3 : current.framesets / Math.max(1, current.wanted);
+    const words = counting ? String(left || '…') : t({ capturing: 'scan.hold', accepted: 'scan.waiting' }[current.state] || 'scan.working');
+    done.setAttribute('stroke-dashoffset', AROUND * (1 - share));
+    ring.classList.toggle('busy', free);
+    word.className = counting ? 'number' : 'word';
+    if (word.textContent !== words) word.textContent = words;
+    leave.hidden = !free;
+    below.hidden = !counting;
+    give.hidden = current.state === 'reconstructing';
   }
 
   async function giveUp(event) {

@@ -1,0 +1,307 @@
+"""The page in Debian's chromium against a real station: what an operator does, and what goes wrong.
+
+`make test-console` runs it: pytest finds it only when it is named, since it needs a browser.
+Pictures of every view go to the folder that CONSOLE_PICTURES names.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from live_console import API, PASSWORD, LiveConsole
+from playwright.sync_api import BrowserContext, Locator, Page, expect, sync_playwright
+
+AXE = Path(__file__).parent / "node_modules/axe-core/axe.min.js"
+_SIZE = {"width": 1024, "height": 768}
+_ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+]  # fmt: skip
+_LONG_MS = 60_000
+
+
+@pytest.fixture(scope="module")
+def context(console: LiveConsole, scans: list[dict[str, Any]]) -> Iterator[BrowserContext]:
+    """A tablet that is logged in."""
+    assert scans
+    chromium = shutil.which("chromium")
+    assert chromium, "chromium is missing; make test-console installs it where it may"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
+        tablet = browser.new_context(viewport=_SIZE, has_touch=True, locale="en-GB")  # type: ignore[arg-type]
+        page = tablet.new_page()
+        page.goto(console.url)
+        page.fill("#password", "wrong password")
+        page.click("#login")
+        expect(page.get_by_role("alert")).to_contain_text("wrong")
+        _picture(page, "login")
+        page.fill("#password", PASSWORD)
+        page.click("#login")
+        expect(page.locator("#rail")).to_be_visible()
+        page.close()
+        yield tablet
+        browser.close()
+
+
+@pytest.fixture
+def page(context: BrowserContext) -> Iterator[Page]:
+    """A page whose script never fails."""
+    page = context.new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("dialog", lambda dialog: errors.append(dialog.message))
+    yield page
+    page.close()
+    assert errors == []
+
+
+def _picture(page: Page, name: str) -> None:
+    folder = os.environ.get("CONSOLE_PICTURES")
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=str(Path(folder) / f"{name}.png"))
+
+
+def _open(page: Page, console: LiveConsole, view: str) -> None:
+    page.goto(f"{console.url}/#/{view}")
+
+
+def _more_frames(card: Locator, count: int) -> None:
+    """Wait for so many more pictures of a camera."""
+    wanted = int(card.get_attribute("data-frames") or 0) + count
+    deadline_s = time.monotonic() + 60.0
+    while int(card.get_attribute("data-frames") or 0) < wanted:
+        assert time.monotonic() < deadline_s, "no new pictures"
+        time.sleep(0.1)
+
+
+def _accessible(page: Page) -> None:
+    """axe-core finds nothing serious."""
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("axe.run()")["violations"]
+    grave = [
+        (one["id"], [node["html"][:120] for node in one["nodes"]])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]
+    assert grave == []
+
+
+def test_four_moving_pictures(page: Page, console: LiveConsole) -> None:
+    _open(page, console, "booth")
+    cards = page.locator("[data-camera]")
+    expect(cards).to_have_count(4)
+    for index in range(4):
+        expect(cards.nth(index)).to_have_attribute("data-state", "streaming", timeout=20_000)
+    for index in range(4):
+        _more_frames(cards.nth(index), 5)
+    moving = page.evaluate(
+        """async () => {
+          const canvas = document.querySelector('[data-camera] canvas');
+          const pixels = () => canvas.getContext('2d').getImageData(0, 0, 320, 240).data;
+          const before = pixels();
+          for (let tries = 0; tries < 20; tries += 1) {
+            await new Promise((resolve) => setTimeout(resolve, 200));
+            if (pixels().some((value, i) => value !== before[i])) return true;
+          }
+          return false;
+        }"""
+    )
+    assert moving
+    _picture(page, "booth")
+    _accessible(page)
+
+
+def test_a_scan_from_the_label_to_the_verdict(
+    page: Page, context: BrowserContext, console: LiveConsole
+) -> None:
+    person = context.new_page()
+    person.goto(f"{console.url}/person")
+    expect(person.locator("svg")).to_be_visible()
+    _picture(person, "person-guide")
+    _accessible(person)
+    _open(page, console, "scan")
+    page.fill("#label", "Order 77")
+    _picture(page, "scan")
+    _accessible(page)
+    page.click("#go")
+    expect(person.locator("body")).to_have_attribute("data-screen", "countdown")
+    _picture(person, "person-countdown")
+    _picture(page, "scan-countdown")
+    expect(page.locator("#leave")).to_be_visible(timeout=_LONG_MS)
+    expect(person.locator("body")).to_have_attribute("data-screen", "free")
+    _picture(person, "person-free")
+    expect(page.locator("#verdict")).to_be_visible(timeout=_LONG_MS)
+    assert page.locator("#verdict").get_attribute("data-verdict") in ("ok", "rescan")
+    _picture(page, "scan-verdict")
+    _accessible(page)
+    # One tap scans the same order again; then it is given up.
+    page.click("#again")
+    page.click("#give-up")
+    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "failed", timeout=_LONG_MS)
+    person.close()
+
+
+def test_a_result_turns_and_lights_up(
+    page: Page, console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    _open(page, console, f"result/{scans[0]['scan_id']}")
+    canvas = page.locator("canvas[data-ready=yes]")
+    expect(canvas).to_be_visible(timeout=_LONG_MS)
+    eye = canvas.get_attribute("data-eye")
+    box = canvas.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 200, box["y"] + 300)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 320, box["y"] + 310, steps=5)
+    page.mouse.up()
+    expect(canvas).not_to_have_attribute("data-eye", eye or "")
+    page.click("tr[data-name=waist_girth]")
+    expect(page.locator("tr[data-name=waist_girth]")).to_have_attribute("aria-selected", "true")
+    expect(page.locator("#line-name")).to_contain_text("Waist girth")
+    _picture(page, "result")
+    value = page.locator("tr[data-name=waist_girth] b")
+    centimetres = float(value.inner_text())
+    page.get_by_role("button", name="in", exact=True).click()
+    expect(value).not_to_have_text(f"{centimetres:.1f}")
+    assert float(value.inner_text()) == pytest.approx(centimetres / 2.54, abs=0.03)
+    page.get_by_role("button", name="Standard pose").click()
+    expect(page.get_by_text("Lines show where")).to_be_visible()
+    # A line is touched: its row is found. The waist's line crosses the middle of the body.
+    page.click("tr[data-name=waist_girth]")
+    page.get_by_role("button", name="Front").click()
+    page.get_by_role("button", name="cm", exact=True).click()
+    page.get_by_role("button", name="As scanned").click()
+    page.get_by_role("button", name="Points").click()
+    _picture(page, "result-points")
+    page.click("#download")
+    expect(page.locator("#downloads a").first).to_be_visible()
+    with page.expect_download() as download:
+        page.locator("#downloads a", has_text="CSV").click()
+    assert "Order 1234" in Path(download.value.path()).read_text()
+    _accessible(page)
+
+
+def test_a_touched_line_finds_its_row(
+    page: Page, console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    _open(page, console, f"result/{scans[0]['scan_id']}")
+    canvas = page.locator("canvas[data-ready=yes]")
+    expect(canvas).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#rows tr").first).to_be_visible()
+    box = canvas.bounding_box()
+    assert box is not None
+    chosen = page.locator("tr[aria-selected=true]")
+    for share in (0.35, 0.4, 0.45, 0.5, 0.55):
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + share * box["height"])
+        if chosen.count():
+            break
+    expect(chosen).to_have_count(1)
+
+
+def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> None:
+    """A stored script must not run: a dialog would fail the page."""
+    _open(page, console, "history")
+    page.fill("#search", "<script>")
+    row = page.locator("tr[data-scan]", has_text="<script>alert(1)</script>")
+    expect(row).to_be_visible()
+    row.get_by_role("link", name="Open").click()
+    expect(page.locator("h1")).to_have_text("<script>alert(1)</script>")
+
+
+def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
+    gone = console.scan("to be deleted")
+    _open(page, console, "history")
+    expect(page.locator("tr[data-scan]").nth(2)).to_be_visible()
+    _picture(page, "history")
+    _accessible(page)
+    done = page.locator(".check:enabled")
+    done.nth(0).check()
+    done.nth(1).check()
+    page.click("#compare")
+    expect(page.locator("#compared tbody tr").nth(40)).to_be_attached(timeout=_LONG_MS)
+    expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=_LONG_MS)
+    _picture(page, "compare")
+    _accessible(page)
+    _open(page, console, "history")
+    row = page.locator(f"tr[data-scan='{gone['scan_id']}']")
+    row.get_by_role("button", name="Delete").click()
+    _picture(page, "delete")
+    page.click("#affirm")
+    expect(row).to_have_count(0)
+    assert not (console.config.spool.folder / "outbox" / gone["scan_id"]).exists()
+
+
+def test_a_calibration_step_from_recordings(page: Page, console: LiveConsole) -> None:
+    _open(page, console, "calibration")
+    expect(page.locator("#now")).to_be_visible()
+    _accessible(page)
+    page.click("button[data-step=floor]")
+    expect(page.locator("#halt")).to_be_visible(timeout=_LONG_MS)
+    _picture(page, "calibration-running")
+    expect(page.locator("#log")).to_contain_text("empty booth kept", timeout=_LONG_MS)
+    expect(page.locator("#calibrate")).to_be_visible(timeout=_LONG_MS)
+    _picture(page, "calibration")
+    page.click("button[data-step=solve]")
+    expect(page.locator("#task-error")).to_be_visible(timeout=_LONG_MS)
+
+
+def test_a_lost_camera_is_told_within_two_seconds(page: Page, console: LiveConsole) -> None:
+    _open(page, console, "booth")
+    card = page.locator("[data-camera=back-upper]")
+    expect(card).to_have_attribute("data-state", "streaming", timeout=20_000)
+    victim = console.station.pids("capture", "back-upper")[0]
+    # Stopped and not killed: the supervisor would have it back before anybody could look.
+    os.kill(victim, signal.SIGSTOP)
+    began_s = time.monotonic()
+    try:
+        expect(card.locator(".remedy")).to_contain_text("capture process", timeout=20_000)
+        print(f"a lost camera and its remedy: {time.monotonic() - began_s:.2f} s")
+        _picture(page, "booth-lost-camera")
+        _accessible(page)
+    finally:
+        os.kill(victim, signal.SIGCONT)
+    expect(card).to_have_attribute("data-state", "streaming", timeout=_LONG_MS)
+
+
+def test_a_lost_console_comes_back_by_itself(page: Page, console: LiveConsole) -> None:
+    _open(page, console, "booth")
+    expect(page.locator("[data-camera]").first).to_be_visible()
+    os.kill(console.station.pids("console")[0], signal.SIGKILL)
+    expect(page.locator("#lost")).to_be_visible(timeout=_LONG_MS)
+    _picture(page, "console-lost")
+    expect(page.locator("#lost")).to_have_count(0, timeout=_LONG_MS)
+    _more_frames(page.locator("[data-camera]").first, 3)
+    # The session outlived the console: nobody was asked to log in again.
+    expect(page.locator("#password")).to_have_count(0)
+
+
+def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) -> None:
+    page.goto(console.url)
+    page.select_option("#language", "zh")
+    expect(page.locator("h1")).to_have_text("扫描", timeout=20_000)
+    assert page.evaluate("document.documentElement.lang") == "zh-CN"
+    _open(page, console, f"result/{scans[0]['scan_id']}")
+    expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
+    _picture(page, "result-zh")
+    page.select_option("#language", "en")
+    expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("Waist", timeout=20_000)
+
+
+def test_the_page_asks_nobody_else(context: BrowserContext, console: LiveConsole) -> None:
+    """No font, no script, no statistics from anywhere but the console itself."""
+    page = context.new_page()
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    for path in ("/#/scan", "/#/booth", "/#/history", "/person", f"{API}/docs"):
+        page.goto(console.url + path)
+        page.wait_for_timeout(300)
+    own = (console.url, "blob:", console.url.replace("http", "ws"))
+    assert [url for url in asked if not url.startswith(own)] == []
+    page.close()

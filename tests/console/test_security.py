@@ -1,0 +1,309 @@
+"""Who is refused: other sites, wrong tokens, guessed passwords, large, slow, crooked requests."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import ssl
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import websockets
+from click.testing import CliRunner
+from live_console import API, PASSWORD, LiveConsole
+
+from station.console.security.certificate import make_certificate
+from station.console.security.origin import host_allowed, own_names, same_origin
+from station.console.security.throttle import FREE_TRIES, LoginThrottle, pause_s
+from station.console.security.vault import Vault
+from station.console.server import check_exposure
+from station.core.config import ConsoleConfig
+from station.core.errors import BoothError, ConfigError
+
+
+@pytest.fixture
+def vault(tmp_path: Path) -> Vault:
+    return Vault(tmp_path / "console")
+
+
+def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:
+    secret = vault.make_token("orders", ("read",), None)
+    session = vault.open_session(1.0)
+    vault.set_password("a good password")
+    stored = b"".join(p.read_bytes() for p in (tmp_path / "console").iterdir())
+    for text in (secret, session, "a good password"):
+        assert text.encode() not in stored
+    assert b"$argon2id$" in stored
+    assert all((p.stat().st_mode & 0o077) == 0 for p in (tmp_path / "console").iterdir())
+    # A new password ends every session.
+    assert not vault.session_holds(session)
+    assert vault.check_password("a good password")
+    assert not vault.check_password("another password")
+    with pytest.raises(BoothError, match="8 characters"):
+        vault.set_password("short")
+
+
+def test_tokens_expire_and_are_revoked(vault: Vault) -> None:
+    gone = vault.make_token("gone", ("read",), 0.0)
+    kept = vault.make_token("kept", ("scan", "read"), 1.0)
+    assert vault.find_token(gone) is None
+    found = vault.find_token(kept)
+    assert found is not None
+    assert found.scopes == ("read", "scan")
+    with pytest.raises(BoothError, match="already"):
+        vault.make_token("kept", ("read",), None)
+    vault.revoke_token("kept")
+    assert vault.find_token(kept) is None
+    with pytest.raises(BoothError, match="no token"):
+        vault.revoke_token("kept")
+
+
+def test_a_program_gets_sixty_seconds_for_each_guess() -> None:
+    throttle, now_s = LoginThrottle(), 0.0
+    for _ in range(FREE_TRIES):
+        assert throttle.wait_s("a", now_s) == 0.0
+        throttle.failed("a", now_s)
+    assert throttle.wait_s("a", now_s) == 1.0
+    for _ in range(100):
+        now_s += throttle.wait_s("a", now_s)
+        throttle.failed("a", now_s)
+    assert throttle.wait_s("a", now_s) == 60.0 == pause_s(10_000)
+    assert throttle.wait_s("b", now_s) == 0.0
+    throttle.succeeded("a")
+    assert throttle.wait_s("a", now_s) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("host", "allowed"),
+    [
+        ("127.0.0.1:8420", True), ("localhost", True), ("[::1]:8420", True), ("192.168.1.9", True),
+        ("evil.example", False), ("127.0.0.1.evil.example", False), ("", False),
+        ("a@localhost", False), ("localhost:port", False), ("shop.local", True),
+    ],
+)  # fmt: skip
+def test_hosts(host: str, allowed: bool) -> None:
+    """A name that somebody pointed at this address must not be served (DNS rebinding)."""
+    assert host_allowed(host, own_names(["shop.local"])) is allowed
+
+
+def test_origins() -> None:
+    assert same_origin("http://localhost:8420", "localhost:8420", "http")
+    assert not same_origin("http://localhost:8421", "localhost:8420", "http")
+    assert not same_origin("https://localhost:8420", "localhost:8420", "http")
+    assert not same_origin("null", "localhost:8420", "http")
+    assert not same_origin("http://[", "localhost", "http")
+
+
+def test_beyond_this_machine_password_and_certificate_are_needed(tmp_path: Path) -> None:
+    assert not check_exposure(ConsoleConfig(folder=tmp_path), has_password=False)
+    open_to_all = ConsoleConfig(folder=tmp_path, host="0.0.0.0")
+    with pytest.raises(ConfigError, match="--set-password"):
+        check_exposure(open_to_all, has_password=False)
+    with pytest.raises(ConfigError, match="--make-certificate"):
+        check_exposure(open_to_all, has_password=True)
+    path = make_certificate(tmp_path, ["booth.shop.example", "192.168.1.9"])
+    assert check_exposure(open_to_all, has_password=True)
+    assert ((tmp_path / "key.pem").stat().st_mode & 0o077) == 0
+    ssl.create_default_context(cafile=str(path))
+
+
+def test_tokens_on_the_command_line(tmp_path: Path) -> None:
+    from station.cli import station
+
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    option = ["--config", str(config)]
+    made = CliRunner().invoke(station, ["token", "make", "orders", "--scope", "scan", *option])
+    secret = made.output.splitlines()[0]
+    assert Vault(tmp_path / "console").find_token(secret) is not None
+    assert "orders" in CliRunner().invoke(station, ["token", "list", *option]).output
+    assert CliRunner().invoke(station, ["token", "revoke", "orders", *option]).exit_code == 0
+    assert Vault(tmp_path / "console").find_token(secret) is None
+
+
+def _status(answer: httpx.Response) -> int:
+    assert answer.headers["content-type"].startswith("application/problem+json"), answer.text
+    return answer.status_code
+
+
+def test_scopes(console: LiveConsole) -> None:
+    with console.anonymous() as client:
+        for path in ("/booth", "/scans", "/events", "/task", "/calibrations"):
+            assert _status(client.get(path)) == 401
+        wrong = {"Authorization": "Bearer booth_nothing"}
+        assert _status(client.get("/booth", headers=wrong)) == 401
+        assert client.get("/session").json()["logged_in"] is False
+    with console.client("read") as client:
+        assert client.get("/booth").status_code == 200
+        assert _status(client.post("/scans", json={})) == 403
+        assert _status(client.delete("/scans/x")) == 403
+    with console.client("scan") as client:
+        assert _status(client.post("/calibration", json={})) == 403
+
+
+def test_other_sites_are_refused(console: LiveConsole) -> None:
+    with console.client() as client:
+        for origin in ("http://evil.example", "null", f"https://127.0.0.1:{console.port}"):
+            refused = client.post("/booth/stop", headers={"Origin": origin})
+            assert _status(refused) == 403
+        own = {"Origin": console.url}
+        assert client.post("/booth/start", headers=own).status_code == 200
+        cross = client.get("/booth", headers={"Sec-Fetch-Site": "cross-site"})
+        assert _status(cross) == 403
+        renamed = client.get("/booth", headers={"Host": "evil.example"})
+        assert _status(renamed) == 421
+
+
+def test_a_wrong_origin_opens_no_websocket(console: LiveConsole) -> None:
+    url = f"ws://127.0.0.1:{console.port}{API}/pictures"
+    token = {"Authorization": f"Bearer {console.tokens['read']}"}
+
+    async def rejected(**options: Any) -> bool:
+        try:
+            async with websockets.connect(url, **options) as socket_:
+                await socket_.send("next")
+                await asyncio.wait_for(socket_.recv(), 5)
+            return False
+        except (websockets.InvalidStatus, websockets.ConnectionClosed):
+            return True
+
+    async def all_of_them() -> list[bool]:
+        return [
+            await rejected(origin="http://evil.example", additional_headers=token),
+            await rejected(origin=console.url),
+            await rejected(),
+            await rejected(origin=console.url, additional_headers=token),
+        ]
+
+    assert asyncio.run(all_of_them()) == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../booth.toml", "..%2f..%2fbooth.toml", "%2e%2e/result.json", "/etc/passwd", ".hidden",
+     "result.json%00.png", "..", "mesh.ply/..", "%5c..%5cbooth.toml"],
+)  # fmt: skip
+def test_no_path_leads_out_of_a_result(
+    console: LiveConsole, scans: list[dict[str, Any]], name: str
+) -> None:
+    path = f"/scans/{scans[0]['scan_id']}/files/{name}"
+    request = (
+        f"GET {API}{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n"
+        f"Authorization: Bearer {console.tokens['manage']}\r\n\r\n"
+    )
+    answer = _raw(console, request.encode())
+    assert answer.split(b" ")[1] in (b"404", b"422", b"405"), answer[:300]
+    assert b"[[cameras]]" not in answer
+
+
+def test_the_page_runs_no_script_but_its_own(console: LiveConsole) -> None:
+    for path in ("/", "/person", f"{API}/docs"):
+        answer = httpx.get(console.url + path)
+        policy = answer.headers["content-security-policy"]
+        assert "script-src 'self'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "<script>" not in answer.text
+        assert " on" not in answer.text.split("<body")[1].replace(" one", "")
+
+
+def test_a_login_is_a_strict_cookie(console: LiveConsole) -> None:
+    with console.anonymous() as client:
+        assert _status(client.post("/session", json={"password": "wrong password"})) == 401
+        answer = client.post("/session", json={"password": PASSWORD})
+        cookie = answer.headers["set-cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=strict" in cookie
+        assert client.get("/booth").status_code == 200
+        # A page of another site has the cookie, too; its Origin gives it away.
+        evil = client.post("/booth/stop", headers={"Origin": "http://evil.example"})
+        assert _status(evil) == 403
+        assert client.delete("/session").status_code == 200
+        assert _status(client.get("/booth")) == 401
+
+
+def _raw(console: LiveConsole, data: bytes, *, wait_s: float = 15.0) -> bytes:
+    with socket.create_connection(("127.0.0.1", console.port), timeout=wait_s) as connection:
+        connection.sendall(data)
+        received = b""
+        try:
+            while part := connection.recv(65536):
+                received += part
+        except (TimeoutError, ConnectionResetError):
+            pass
+        return received
+
+
+def test_large_requests_are_refused(console: LiveConsole) -> None:
+    with console.anonymous() as client:
+        assert _status(client.post("/session", content=b"x" * 70_000)) == 413
+
+        def endless() -> Any:
+            for _ in range(80):
+                yield b"x" * 1000
+
+        assert _status(client.post("/session", content=endless())) == 413
+    head = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"a" * 40_000 + b"\r\n\r\n"
+    assert _raw(console, head).split(b" ")[1] in (b"400", b"431")
+    crooked = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: -5\r\n\r\n"
+    assert _raw(console, crooked).split(b" ")[1] in (b"400", b"413")
+    assert console.answers()
+
+
+def test_slow_senders_are_not_waited_for(console: LiveConsole) -> None:
+    """Ten seconds for a head, ten for a body; meanwhile everybody else is served."""
+    began_s = time.monotonic()
+    heads = [socket.create_connection(("127.0.0.1", console.port), timeout=20.0) for _ in range(20)]
+    for connection in heads:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+    body = socket.create_connection(("127.0.0.1", console.port), timeout=20.0)
+    body.sendall(
+        f"POST {API}/session HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+        "Content-Type: application/json\r\nContent-Length: 50\r\n\r\n{".encode()
+    )
+    assert console.answers()
+    assert b" 408 " in body.recv(65536)
+    for connection in heads:
+        assert connection.recv(100) == b""
+        connection.close()
+    body.close()
+    assert time.monotonic() - began_s < 19.0
+    assert console.answers()
+
+
+def test_ten_thousand_wrong_passwords(console: LiveConsole) -> None:
+    """Most are refused unread; the station goes on meanwhile, and so does whoever is logged in."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    body = json.dumps({"password": "guess"}).encode()
+    head = (
+        f"POST {API}/session HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+        f"Content-Length: {len(body)}\r\n\r\n"
+    ).encode()
+
+    def guess(count: int) -> list[int]:
+        found = []
+        with socket.create_connection(("127.0.0.1", console.port), timeout=30.0) as connection:
+            stream = connection.makefile("rb")
+            for _ in range(count):
+                connection.sendall(head + body)
+                status = int(stream.readline().split()[1])
+                length = 0
+                while (line := stream.readline()) != b"\r\n":
+                    if line.lower().startswith(b"content-length"):
+                        length = int(line.split()[1])
+                stream.read(length)
+                found.append(status)
+        return found
+
+    with ThreadPoolExecutor(4) as pool:
+        statuses = [s for part in pool.map(guess, [2500] * 4) for s in part]
+    assert len(statuses) == 10_000
+    assert set(statuses) <= {401, 429}
+    assert statuses.count(401) < 40
+    with console.client("read") as client:
+        assert client.get("/booth").status_code == 200

@@ -1,0 +1,104 @@
+"""A real station on recordings, its console, and the clients of a test."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+from running_station import Station
+
+from station.console.security.vault import SCOPES, Scope, Vault
+from station.core.config import load_config
+
+PASSWORD = "correct horse battery"
+API = "/api/v1"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class LiveConsole:
+    """A station with a console, a password and tokens of every scope."""
+
+    def __init__(self, booth: Path, folder: Path) -> None:
+        self.port = free_port()
+        recordings = folder / "recordings"
+        recordings.mkdir()
+        # Whoever stands still is as good as an empty booth for looking at it.
+        os.symlink(booth, recordings / "empty")
+        text = (booth / "booth.toml").read_text().replace('recording = "', f'recording = "{booth}/')
+        text = text.replace("freenect", "recorded")
+        (folder / "booth.toml").write_text(
+            f'name = "Shop 1"\ncalibration = "{booth}/calibration.json"\n{text}\n'
+            f'[console]\nport = {self.port}\ncountdown_s = 1\nrecordings = "recordings"\n'
+        )
+        self.config = load_config(folder / "booth.toml")
+        vault = Vault(self.config.console.folder)
+        vault.set_password(PASSWORD)
+        self.tokens = {scope: vault.make_token(scope, self._below(scope), 1.0) for scope in SCOPES}
+        vault.close()
+        self.station = Station(folder / "booth.toml")
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.station.wait_until(self.answers, "the console answers")
+
+    @staticmethod
+    def _below(scope: Scope) -> tuple[Scope, ...]:
+        return SCOPES[: SCOPES.index(scope) + 1]
+
+    def answers(self) -> bool:
+        try:
+            return httpx.get(f"{self.url}{API}/session").status_code == 200
+        except httpx.HTTPError:
+            return False
+
+    def client(self, scope: Scope = "manage") -> httpx.Client:
+        headers = {"Authorization": f"Bearer {self.tokens[scope]}"}
+        return httpx.Client(base_url=self.url + API, headers=headers, timeout=60.0)
+
+    def anonymous(self) -> httpx.Client:
+        return httpx.Client(base_url=self.url + API, timeout=60.0)
+
+    def start_sensors(self) -> None:
+        with self.client() as client:
+            client.post("/booth/start").raise_for_status()
+            self.station.wait_until(
+                lambda: all(
+                    camera["state"] == "streaming"
+                    for camera in client.get("/booth").json()["cameras"]
+                ),
+                "every camera streams",
+            )
+
+    def scan(self, label: str, key: str | None = None) -> dict[str, Any]:
+        """Take a scan and wait for its end."""
+        with self.client("scan") as client:
+            headers = {} if key is None else {"Idempotency-Key": key}
+            for _ in range(100):
+                answer = client.post("/scans", json={"label": label}, headers=headers)
+                if answer.status_code == 202:
+                    break
+                # A camera may have begun to stream and not be matched with the others yet.
+                time.sleep(0.2)
+            assert answer.status_code == 202, answer.text
+            return self.wait_for(answer.json()["scan_id"])
+
+    def wait_for(self, scan_id: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+
+        def done() -> bool:
+            with self.client("read") as client:
+                found.update(client.get(f"/scans/{scan_id}").json())
+            return found["state"] in ("delivered", "rescan", "failed")
+
+        self.station.wait_until(done, f"scan {scan_id} ends", 120.0)
+        return found
+
+    def close(self) -> None:
+        self.station.close()
