@@ -82,12 +82,13 @@ class LiveConsole:
             headers = {} if key is None else {"Idempotency-Key": key}
             for _ in range(100):
                 answer = client.post("/scans", json={"label": label}, headers=headers)
-                if answer.status_code == 202:
+                assert answer.status_code == 202, answer.text
+                found = self.wait_for(answer.json()["scan_id"])
+                if "gives no frames" not in "".join(found["reasons"]):
                     break
                 # A camera may have begun to stream and not be matched with the others yet.
                 time.sleep(0.2)
-            assert answer.status_code == 202, answer.text
-            return self.wait_for(answer.json()["scan_id"])
+            return found
 
     def wait_for(self, scan_id: str) -> dict[str, Any]:
         found: dict[str, Any] = {}

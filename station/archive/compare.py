@@ -16,7 +16,7 @@ from station.archive.terms import Language, plain_name, split_side
 
 @dataclass(frozen=True, slots=True)
 class SurfaceDifference:
-    """How far the second body's surface lies from the first's."""
+    """Distances from the first body's surface to the second's."""
 
     signed_m: Array
     """(n,) at each vertex of the first mesh: positive where the second body is larger."""

@@ -51,7 +51,7 @@ class View:
 
 
 def heading_rad(result: Path) -> float:
-    """How far the person stood turned from the front, about the vertical."""
+    """Angle by which the person stood turned from the front, about the vertical."""
     try:
         twist = json.loads((result / "result.json").read_bytes())["pose"]["pelvis"]
     except (OSError, ValueError, KeyError):

@@ -24,7 +24,7 @@ again. In the order in which a scan passes them: of a scan in two, the later cou
 
 @dataclass(frozen=True, slots=True)
 class ScanRecord:
-    """What is known of a scan on disk."""
+    """A scan on disk."""
 
     scan_id: str
     state: ScanState
@@ -36,7 +36,7 @@ class ScanRecord:
     """UTC, ISO 8601: when it was delivered or given up; empty before."""
     reasons: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """What each step of the reconstruction took."""
+    """Duration of each step of the reconstruction."""
 
     @property
     def verdict(self) -> str:

@@ -10,7 +10,7 @@ from station.archive.terms import TERMS, plain_name, split_side
 
 VERSION = "0.3.4"
 _NO_SYSTEM = "998"
-"""Of pattern making systems: none."""
+"""The code for no pattern making system."""
 _NO_BIRTHDAY = "1800-01-01"
 
 
@@ -43,7 +43,7 @@ def smis(scan: ScanRecord, document: dict[str, Any]) -> bytes:
 
 
 def seamly_name(name: str) -> str:
-    """What SeamlyMe calls a row."""
+    """SeamlyMe's name of a row."""
     stem, side = split_side(name)
     known = TERMS[stem].seamly if stem in TERMS else ""
     return known if known and side != "left" else f"@{name}"

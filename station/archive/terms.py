@@ -1,4 +1,4 @@
-"""What measurements are called: plain names in two languages, and in SeamlyMe. The one table."""
+"""Names of measurements: plain ones in two languages, and SeamlyMe's. The one table."""
 
 from __future__ import annotations
 

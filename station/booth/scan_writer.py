@@ -148,6 +148,7 @@ class ScanWriter:
             scan_id=order.scan_id,
             created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
             label=order.label,
+            booth=self._config.name,
             depth_scale_m=collection.depth_scale_m(),
             rig=rig,
             frames={name: _captured(collection, name) for name in self._names},

@@ -1,4 +1,4 @@
-"""How the console is served: addresses, certificate, and how long a slow sender is waited for."""
+"""The server of the console: address, certificate, limits on slow senders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has been handed over to whom, and what waits: on disk, so that no restart forgets it.
+"""Record of what has been handed over to whom: on disk, so that no restart forgets it.
 
 handover/<target>/waiting/<scan id>.json   tries, when next, what went wrong
 handover/<target>/done/<scan id>           handed over; kept as long as the result is
@@ -28,7 +28,7 @@ class Waiting:
     scan_id: str
     tries: int = 0
     next_s: float = 0.0
-    """When to try, seconds since 1970."""
+    """Moment of the next try, seconds since 1970."""
     error: str = ""
 
     def document(self) -> dict[str, Any]:

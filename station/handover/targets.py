@@ -1,4 +1,4 @@
-"""How one result reaches one target: copied into a folder, or announced by a signed POST."""
+"""Targets of results: a folder that gets copies, a webhook that gets signed POSTs."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class WebhookTarget:
         return f"t={seconds},v1={mac}"
 
     def document(self, scan: ScanRecord, result: Path) -> Mapping[str, Any]:
-        """What is posted."""
+        """The document that is posted."""
         at = f"{self._link}/api/v1/scans/{scan.scan_id}"
         tables = {pose: rows(read_measurements(result, pose), "m", "en") for pose in FILES}
         return {

@@ -32,7 +32,7 @@ sent: Counter[int] = Counter()
 
 @pytest.fixture(scope="module")
 def operations(console: LiveConsole, scans: list[dict[str, Any]]) -> list[Any]:
-    """Of the running console's document; events, which never end, are tested by themselves."""
+    """Operations of the running console but for the events, which never end."""
     assert scans
     schema = schemathesis.openapi.from_url(f"{console.url}{API}/openapi.json")
     listed = schema.exclude(path=f"{API}/events").get_all_operations()

@@ -1,4 +1,4 @@
-"""Who is refused: other sites, wrong tokens, guessed passwords, large, slow, crooked requests."""
+"""Refusals: other sites, wrong tokens, guessed passwords, large, slow, crooked requests."""
 
 from __future__ import annotations
 

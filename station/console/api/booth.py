@@ -45,7 +45,7 @@ router = APIRouter()
 
 @router.get("/session", responses=responses(), tags=["session"])
 def session(request: Request, console: Booth) -> Session:
-    """Who asks, and whether a login is needed."""
+    """The session: its scopes, and whether a login is needed."""
     try:
         caller: Caller | None = caller_of(request)
     except ProblemError:
@@ -194,7 +194,7 @@ def use(name: str, console: Booth, caller: Manager) -> Calibration:
     tags=["calibration"],
 )
 def compare(first: str, second: str, console: Booth, caller: Reader) -> list[CameraShift]:  # noqa: ARG001
-    """How far each camera stands elsewhere in the second calibration, seen by the reference."""
+    """Shift and turn of each camera between two calibrations, seen by the reference."""
     before, after = _known(console, first).rig, _known(console, second).rig
     shifts = []
     for name in before.cameras.keys() & after.cameras.keys():

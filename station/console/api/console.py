@@ -100,7 +100,7 @@ class Console:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request."""
+    """The sender of a request."""
 
     name: str
     """The token's name, or "operator"."""
@@ -116,7 +116,7 @@ def console_of(connection: HTTPConnection) -> Console:
 
 
 def caller_of(connection: HTTPConnection) -> Caller:
-    """Who sends a request or opens a WebSocket.
+    """The sender of a request, or of a WebSocket.
 
     Raises:
         ProblemError: 401, nobody who is known.
@@ -174,7 +174,7 @@ IdempotencyKey = Annotated[
 
 
 def once(console: Console, caller: Caller, key: str | None, request: str, answer: str) -> str:
-    """What a key stands for: `answer` if it is new, else what it began the first time.
+    """The answer that a key stands for: `answer` if it is new, else that of the first time.
 
     Raises:
         ProblemError: 422, the key was used for another request.

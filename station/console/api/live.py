@@ -40,7 +40,7 @@ async def events(
     last_event_id: Annotated[str, Header(max_length=60)] = "",
     follow: Annotated[bool, Query(description="false: what there is, then the end")] = True,
 ) -> StreamingResponse:
-    """What happens, as it happens. With Last-Event-ID a program goes on where it stopped."""
+    """Events as they happen. With Last-Event-ID a program goes on where it stopped."""
     stream = _while_allowed(request, console, console.events.stream(last_event_id, follow))
     return StreamingResponse(stream, media_type="text/event-stream")
 

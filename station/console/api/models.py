@@ -1,4 +1,4 @@
-"""What requests hold and what is answered."""
+"""Bodies of requests and of answers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class _Strict(BaseModel):
 
 
 class Login(_Strict):
-    """What the operator types."""
+    """The password that the operator types."""
 
     password: str = Field(max_length=1000)
 
 
 class Session(BaseModel):
-    """Who asks, and how the page shows things."""
+    """The session, and how the page shows things."""
 
     logged_in: bool
     password_set: bool
@@ -53,7 +53,7 @@ class Check(BaseModel):
 
 
 class Delivery(BaseModel):
-    """What another program has not been given yet."""
+    """A result that waits to be handed over."""
 
     target: str
     scan_id: str
@@ -116,7 +116,7 @@ class ScanPage(BaseModel):
 
 
 class Removed(BaseModel):
-    """What was deleted."""
+    """The scans that were deleted."""
 
     scans: list[str]
 
@@ -158,7 +158,7 @@ class Measurements(BaseModel):
 
 
 class Part(BaseModel):
-    """How well one part of the body was seen."""
+    """One part of the body, and how well it was seen."""
 
     name: str
     coverage: float
@@ -211,7 +211,7 @@ class Calibration(BaseModel):
 
 
 class CameraShift(BaseModel):
-    """How a camera stands in the second calibration, against the first, seen by the reference."""
+    """Shift and turn of a camera from one calibration to another."""
 
     camera: str
     shift_mm: float
@@ -226,7 +226,7 @@ class NewStep(_Strict):
 
 
 class Answer(_Strict):
-    """What the operator says to a running step."""
+    """The operator's answer to a running step."""
 
     answer: Literal["go", "yes", "no"]
 

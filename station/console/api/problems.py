@@ -55,7 +55,7 @@ _ALWAYS = (401, 403, 408, 413, 421, 422, 431, 503)
 
 
 def responses(*more: int) -> dict[int | str, dict[str, Any]]:
-    """What a route may answer beside its result, for the OpenAPI document."""
+    """Answers of a route beside its result, for the OpenAPI document."""
     schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
     found: dict[int | str, dict[str, Any]] = {
         status: {"description": _MEANINGS[status], "content": {MEDIA_TYPE: schema}}

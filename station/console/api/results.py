@@ -92,7 +92,7 @@ def file(
 
 @router.get("/quality", responses=responses(404))
 def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
-    """How well each part of the body was seen, and which one the verdict doubts."""
+    """Coverage of each part of the body, and which one the verdict doubts."""
     record, folder = _open(console, caller, scan_id, "quality")
     parts = _result(folder).get("quality", {}).get("parts", {})
     reasons = " ".join(record.reasons)

@@ -1,3 +1,3 @@
-"""What changes by the second: events, depth pictures, scans being taken, a calibration being done.
+"""The booth as it changes: events, depth pictures, scans being taken, a calibration being done.
 No HTTP; `api` shows it.
 """

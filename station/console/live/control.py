@@ -19,7 +19,7 @@ class RefusedError(BoothError):
 
 
 def command(config: BoothConfig, request: Request) -> dict[str, Any]:
-    """What control replies.
+    """The reply of the control process.
 
     Raises:
         NotRunningError: nobody does.

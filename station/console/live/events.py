@@ -1,4 +1,4 @@
-"""What happened, numbered, so that a program that lost its connection goes on where it stopped.
+"""Numbered events: a program that lost its connection goes on where it stopped.
 
 An id is `<start>-<number>`; `<start>` is another one after each start of the console. A reader that
 asks for what this log no longer holds gets the event `reset` first: read everything anew.

@@ -61,7 +61,7 @@ class PictureMaker:
     def _inside(
         self, z: NDArray[np.float32], known: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which pixels see into the volume, and which of them are above the floor."""
+        """Masks of the pixels that see into the volume, and of those above the floor."""
         rays = self._world_rays(z.shape)
         low, high = np.array([self._volume.min_m, self._volume.max_m], np.float32)
         inside = known.copy()

@@ -1,4 +1,4 @@
-"""What takes longer than a request: a calibration step, a check of the cameras. One at a time."""
+"""Tasks longer than a request: a calibration step, a check of the cameras. One at a time."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Tasks:
         self._state = _idle()
 
     def state(self) -> dict[str, Any]:
-        """What runs, what it says, what it waits for."""
+        """The running task, its words, the answer that it waits for."""
         with self._lock:
             return {**self._state, "lines": list(self._state["lines"])}
 
     def last_check(self) -> dict[str, Any] | None:
-        """When the cameras were checked last, and what was found."""
+        """The last check of the cameras: its time and what was found."""
         try:
             document = json.loads((self._folder / CHECK_FILE).read_text())
         except (OSError, ValueError):
@@ -67,7 +67,7 @@ class Tasks:
         )
 
     def answer(self, word: str) -> dict[str, Any]:
-        """What the operator says to the running task: "go", "yes" or "no".
+        """Pass on the operator's answer to the running task: "go", "yes" or "no".
 
         Raises:
             RefusedError: it waits for nothing.

@@ -1,3 +1,3 @@
-"""Who may use the console: password, sessions, tokens, where requests may come from, the log of it.
+"""Access to the console: password, sessions, tokens, origins of requests, the log of it.
 Nothing here knows what a request is for.
 """

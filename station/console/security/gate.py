@@ -1,5 +1,4 @@
-"""What every request passes before anything looks at it: sizes, host, origin, and what every answer
-says to the browser."""
+"""The gate that every request passes first (sizes, host, origin), and every answer's headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a password may be tried. Pure."""
+"""A limit on how often a password may be tried. Pure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LoginThrottle:
         """Address -> how often in a row, and when last, seconds."""
 
     def wait_s(self, address: str, now_s: float) -> float:
-        """How long this address has to wait before its next try; 0 if it need not."""
+        """Seconds that this address has to wait before its next try; 0 if it need not."""
         count, last_s = self._failures.get(address, (0, 0.0))
         return max(0.0, last_s + pause_s(count) - now_s)
 

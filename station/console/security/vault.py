@@ -1,4 +1,4 @@
-"""What the console must remember across restarts: sessions, tokens and keys, never in clear.
+"""The console's memory across restarts: sessions, tokens and keys, never in clear.
 
 A session's or token's secret is 256 random bits, so one SHA-256 hides it well; the password is a
 person's, so it is hashed with argon2id (RFC 9106) in a file of its own.
