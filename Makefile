@@ -35,7 +35,7 @@ test-faults: $(VENV)/dev.stamp
 soak: $(VENV)/dev.stamp
 	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long --minutes 60 $(ARGS)
 
-# The console in Debian's chromium, and requests generated from its OpenAPI document.
+# The console in Debian's chromium; long: requests generated from its OpenAPI document.
 test-console test-console-long: $(VENV)/dev.stamp $(VENV)/browser.stamp
 test-console:
 	$(BIN)/python -m pytest tests/console/page_in_browser.py

@@ -67,6 +67,11 @@ export async function scan(main, session) {
     parts = null;
     clearInterval(timer);
     // Events tell sooner; asking now and then bridges a lost connection.
+    if (FINAL.includes(current.state)) {
+      // Refused at once, e.g. because a camera gives no frames: the reason is the verdict.
+      finish();
+      return;
+    }
     timer = setInterval(ask, POLL_MS);
     show({ left_s: session.countdown_s });
   }
