@@ -167,7 +167,7 @@ IdempotencyKey = Annotated[
     str | None,
     Header(
         alias="Idempotency-Key",
-        pattern=r"^[\x21-\x7e]{1,200}$",
+        pattern=r"^[\x20-\x7e]{1,200}$",
         description="the same key never begins the same thing twice",
     ),
 ]
