@@ -145,7 +145,17 @@ class Machine:
 
     def files(self) -> set[str]:
         """Every path on its disk that an installation may have changed."""
-        skipped = ("proc", "sys", "dev", "run", "tmp", "var/log", "var/cache/apt", "var/lib/apt")
+        skipped = (
+            "proc",
+            "sys",
+            "dev",
+            "run",
+            "tmp",
+            "var/tmp",
+            "var/log",
+            "var/cache/apt",
+            "var/lib/apt",
+        )
         found = set()
         for folder, folders, names in os.walk(self.root):
             inside = os.path.relpath(folder, self.root)
