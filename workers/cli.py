@@ -16,6 +16,10 @@ COMMANDS = {
         "workers.scape.learn.cli:evaluate_model",
         "test the model on held-out bodies",
     ),
+    "population": (
+        "workers.scape.learn.cli:population",
+        "compare the training bodies with people",
+    ),
 }
 
 

@@ -21,7 +21,7 @@ from true_measurements import TrueBody
 from station.simulation.scene import Mesh
 from workers.measure.intervals import Pose
 from workers.measure.standing import on_both_feet, standard_turns
-from workers.scape.learn.database import PARTS, BodyDatabase
+from workers.scape.learn.database import PARTS, Shapes, body_database
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, vertex_normals
 
@@ -51,8 +51,8 @@ class UnlikeBodies:
 
     def __init__(self, model: BodyModel, split: UnlikeSplit) -> None:
         self._model, self._split = model, split
-        self._database = BodyDatabase()
-        self._shapes = self._database.sample("test", POOL, _SEEDS[split])
+        self._database = body_database()
+        self._shapes = Shapes({}, {}, np.zeros(0))
         self._poses = _POSE_SHARE * self._database.sample_poses("test", POOL, _SEEDS[split])
         self._subdivision, self.faces = loop_subdivision(self._database.faces, model.vertex_count)
 
@@ -63,6 +63,8 @@ class UnlikeBodies:
 
     def body(self, index: int) -> UnlikeBody:
         """One body (0 to POOL - 1), its middle above the origin, on the floor, facing -y."""
+        if index >= len(self._shapes):
+            self._shapes = self._database.sample("test", index + 1, _SEEDS[self._split])
         shapes = self._shapes.take(np.array([index]))
         poses = np.stack([np.zeros_like(self._standing), self._poses[index], self._standing])
         one = shapes.take(np.zeros(len(poses), np.intp))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -59,14 +60,16 @@ class Trace:
         return found
 
 
-def trace_all(model: BodyModel, vertices: Array) -> list[Trace]:
-    """All rows of the table on a body (P, 3), z up, floor at 0.
+def trace_all(
+    model: BodyModel, vertices: Array, definitions: Sequence[Definition] = DEFINITIONS
+) -> list[Trace]:
+    """The rows of a table on a body (P, 3), z up, floor at 0.
 
     Raises:
         InputError: a plane misses the part of the body that it should cut.
     """
     tracer = _Tracer(model, vertices)
-    return [tracer.trace(definition) for definition in DEFINITIONS]
+    return [tracer.trace(definition) for definition in definitions]
 
 
 @lru_cache(maxsize=64)

@@ -1,3 +1,3 @@
-"""How the model is learned from a database of bodies, and how it is evaluated.
-Nothing that runs in a booth imports this.
+"""Learning of the body model from generated bodies, and its evaluation on held-out ones.
+Nothing that runs in a booth imports this package; it needs the train extra.
 """

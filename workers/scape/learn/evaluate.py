@@ -1,4 +1,4 @@
-"""How good the model is on bodies and poses that it was not learned from, against its bars."""
+"""Evaluation of the model on bodies and poses that it was not learned from, with its bars."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from station.core.errors import FormatError
 from workers.scape.fit.sampling import Sampling
 from workers.scape.learn.database import BodyDatabase
 from workers.scape.learn.pictures import draw_case, draw_components
-from workers.scape.learn.population import population_table
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.learn.registration import distances, register
 from workers.scape.learn.resources import SAMPLES, measure_resources
@@ -24,7 +23,6 @@ from workers.scape.model.sampled import SampledBody
 Array = NDArray[np.float64]
 
 _COMPONENTS = (10, 20, 40, 60, 80, 100, 130, 160)
-_POPULATION = 400
 _RANDOM_BODIES = 20
 _DRAWN_COMPONENTS = 5
 _EXTREMITIES = (*HAND, "foot")
@@ -32,7 +30,7 @@ _EXTREMITIES = (*HAND, "foot")
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What is asked for."""
+    """Options of an evaluation."""
 
     model: Path | None = None
     bodies: int = 100
@@ -55,10 +53,6 @@ def evaluate(plan: Evaluation) -> Iterator[str]:
         f"{model.part_count} parts, {model.beta_count} components"
     )
     yield f"{plan.bodies} held-out bodies, split test, seed {plan.seed}; distances in mm"
-    yield ""
-    everyone = database.sample("train", _POPULATION, plan.seed)
-    female = everyone.phenotypes["gender"] > 0.5
-    yield from population_table(model, database.vertices(everyone), female)
     yield ""
     yield from _compactness(model)
     yield ""
@@ -88,7 +82,7 @@ def _rms(errors: Array) -> Array:
 
 
 def _row(name: str, errors: Array) -> str:
-    """Of distances (bodies, P) in metres."""
+    """Table row of distances (bodies, P) in metres."""
     rms = _rms(errors)
     p95 = 1e3 * float(np.quantile(errors, 0.95))
     return f" {name:<14}{rms.mean():8.2f}{rms.max():8.2f}{p95:8.2f}"

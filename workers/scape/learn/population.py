@@ -1,70 +1,126 @@
-"""The database's bodies beside what is published of people's sizes."""
+"""The database's bodies beside people: every size that a survey and this project both have."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.errors import InputError
-from workers.measure.body import measure_body
-from workers.scape.model.body_model import BodyModel
+from workers.scape.learn.survey import (
+    COMPARISONS,
+    PUBLIC,
+    STATURE,
+    WAIST,
+    Persons,
+    design_matrix,
+    surveyed,
+)
 
 Array = NDArray[np.float64]
 
-PUBLISHED_CM = {
-    "men": {
-        "height": (175.6, 6.9),
-        "chest_girth": (105.9, 8.7),
-        "waist_girth": (94.1, 11.2),
-        "hip_girth": (102.0, 7.7),
-        "thigh_girth_left": (62.5, 5.8),
-    },
-    "women": {
-        "height": (162.8, 6.4),
-        "chest_girth": (94.7, 8.3),
-        "waist_girth": (86.1, 10.0),
-        "hip_girth": (102.1, 7.6),
-        "thigh_girth_left": (61.7, 5.7),
-    },
-}
-"""Mean and standard deviation in the 2012 survey of U.S. Army personnel (ANSUR II, Gordon et al.
-2014, NATICK/TR-15/007; 4,082 men, 1,986 women): fit people, waists at the navel."""
-PUBLIC_WAIST_CM = {"men": 102.0, "women": 98.0}
-"""Mean waist of adults in the United States (NHANES 2015-2018, Fryar et al. 2021, Vital and Health
-Statistics 3-46)."""
+MOST_MEAN_OFF = 0.3
+"""Difference of the means at equal stature, waist and age, in deviations of the survey."""
+SPREADS = (0.8, 1.3)
+"""Standard deviation given stature, waist and age, against the survey's."""
 
 
-def population_table(model: BodyModel, bodies: Array, female: NDArray[np.bool_]) -> Iterator[str]:
-    """Sizes in centimetres of bodies (n, P, 3) in the neutral pose, lines of a table."""
-    yield f"population: {len(bodies)} bodies here against ANSUR II (cm)"
-    yield "                             here                     published"
-    yield "                       mean   sd    p5   p95     mean   sd    p5*  p95*"
-    for sex, chosen in (("men", ~female), ("women", female)):
-        sizes = _sizes(model, bodies[chosen], tuple(PUBLISHED_CM[sex]))
-        for name, (mean, deviation) in PUBLISHED_CM[sex].items():
-            here = sizes[name]
-            low, high = np.quantile(here, [0.05, 0.95])
-            yield (
-                f" {sex:<5} {name.removesuffix('_left'):<13}"
-                f"{here.mean():7.1f}{here.std():5.1f}{low:6.1f}{high:6.1f}"
-                f"   {mean:6.1f}{deviation:5.1f}"
-                f"{mean - 1.645 * deviation:7.1f}{mean + 1.645 * deviation:6.1f}"
-            )
-    waists = ", ".join(f"{sex} {mean:.0f}" for sex, mean in PUBLIC_WAIST_CM.items())
-    yield f" * of a normal distribution. Mean waist of the public (NHANES 2015-2018): {waists} cm"
+@dataclass(frozen=True, slots=True)
+class Likeness:
+    """Comparison of bodies of one sex with people, in one size."""
+
+    name: str
+    mean_m: float
+    """Mean of people."""
+    off_m: float
+    """Bodies less people, at the mean stature, waist and age of people."""
+    off: float
+    """`off_m` in standard deviations of people."""
+    spread_m: float
+    """Standard deviation of people alike in stature, waist and age."""
+    spread: float
+    """Standard deviation of bodies in units of people's."""
+    same_mean: bool
+    """True if the definitions are near enough for means to be compared."""
+
+    @property
+    def met(self) -> bool:
+        low, high = SPREADS
+        return (not self.same_mean or abs(self.off) <= MOST_MEAN_OFF) and low <= self.spread <= high
 
 
-def _sizes(model: BodyModel, bodies: Array, names: tuple[str, ...]) -> dict[str, Array]:
-    """Measured values in centimetres; a body that a plane misses is left out."""
-    found: dict[str, list[float]] = {name: [] for name in names}
-    for body in bodies:
-        try:
-            rows = measure_body(model, body).rows
-        except InputError:
+def likenesses(bodies: Persons, people: Persons) -> list[Likeness]:
+    """Compare bodies with people of the same sex, size by size, at equal stature, waist and age."""
+    there = _known(people).mean(axis=0)
+    found = []
+    for column, comparison in enumerate(COMPARISONS):
+        if column in (STATURE, WAIST):
             continue
-        for row in rows:
-            if row.name in found:
-                found[row.name].append(100.0 * row.value_m)
-    return {name: np.array(values) for name, values in found.items()}
+        theirs, their_spread = _given(people, column, there)
+        ours, our_spread = _given(bodies, column, there)
+        deviation = float(people.sizes[:, column].std())
+        found.append(
+            Likeness(
+                comparison.name,
+                theirs,
+                ours - theirs,
+                (ours - theirs) / deviation,
+                their_spread,
+                our_spread / their_spread,
+                comparison.same_mean,
+            )
+        )
+    return found
+
+
+def _given(persons: Persons, column: int, there: Array) -> tuple[float, float]:
+    """A size expected at a stature, waist and age, and its standard deviation around that."""
+    known = _known(persons) - there
+    design = np.column_stack([np.ones(len(known)), known])
+    values = persons.sizes[:, column]
+    coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
+    return float(coefficients[0]), float((values - design @ coefficients).std())
+
+
+def _known(persons: Persons) -> Array:
+    """(n, 3): stature, waist and age, as the regression of sizes takes them."""
+    sizes = persons.sizes
+    return design_matrix(sizes[:, STATURE], sizes[:, WAIST], persons.age)[:, 1:]
+
+
+def population_table(bodies: Persons) -> Iterator[str]:
+    """Lines of a table that compares bodies with the survey's people."""
+    people = surveyed()
+    yield f"population: {len(bodies.age)} bodies against {len(people.age)} people (ANSUR II)"
+    yield "                    here: median,  p5,   p95   public (NHANES 2015-2018): median"
+    for sex, public in PUBLIC.items():
+        mine = bodies.take(bodies.female == (sex == "women"))
+        for name, column, median in (
+            ("stature", STATURE, public.stature_m),
+            ("waist", WAIST, public.waist_m),
+        ):
+            low, middle, high = 100.0 * np.quantile(mine.sizes[:, column], (0.05, 0.5, 0.95))
+            yield f" {sex:<6}{name:<20}{middle:7.1f}{low:7.1f}{high:7.1f}{100.0 * median:9.1f} cm"
+    yield " mm at equal stature, waist, age    people    off  in sd (bar)  spread  of theirs (bar)"
+    met, judged = 0, 0
+    for sex in PUBLIC:
+        female = sex == "women"
+        mine = bodies.take(bodies.female == female)
+        for row in likenesses(mine, people.take(people.female == female)):
+            judged += 1
+            met += row.met
+            limit = f"{MOST_MEAN_OFF:.1f}" if row.same_mean else "none"
+            yield (
+                f" {sex:<6}{row.name:<28}{1e3 * row.mean_m:8.0f}{1e3 * row.off_m:7.1f}"
+                f"{row.off:7.2f}  ({limit:>4}){1e3 * row.spread_m:8.1f}{row.spread:8.2f}"
+                f"   ({SPREADS[0]:g}-{SPREADS[1]:g})  {'met' if row.met else 'MISSED'}"
+            )
+    yield f" {met} of {judged} sizes met"
+    for comparison in COMPARISONS:
+        if comparison.difference:
+            men, women = (1e3 * offset for offset in comparison.definition_offset_m)
+            yield (
+                f" {comparison.name}: {comparison.difference}; allowed for: "
+                f"men {men:+.0f}, women {women:+.0f} mm"
+            )

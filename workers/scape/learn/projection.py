@@ -19,7 +19,7 @@ PROJECTION_STRIDE = 5
 _STEPS = 8
 _SETTLED_M = 2e-5
 _NOISE_M = 1e-3
-"""Of each sample, against beta ~ N(0, I): the prior barely acts."""
+"""Standard deviation of each sample, against beta ~ N(0, I): the prior barely acts."""
 
 
 def best_fit(
@@ -47,8 +47,8 @@ def best_fit(
         size = rows.shape[2]
         flat = rows.reshape(-1, size)
         normal = (flat.T @ flat).astype(np.float64) / _NOISE_M**2
-        pull = (target - positions).ravel().astype(np.float32)
-        gradient = (flat.T @ pull).astype(np.float64) / _NOISE_M**2
+        residual = (target - positions).ravel().astype(np.float32)
+        gradient = (flat.T @ residual).astype(np.float64) / _NOISE_M**2
         normal[np.diag_indices(size)] += 1.0
         gradient[shape] -= state.beta[:active]
         delta = scipy.linalg.solve(normal, gradient, assume_a="pos")

@@ -47,7 +47,7 @@ _SCHEDULE = (
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """From the points of a surface to the fitted one, and back."""
+    """Distances from a surface to the fitted one, and back."""
 
     to_model_m: Array
     """(n,): of the surface's vertices."""
@@ -84,8 +84,8 @@ def register(
             body = model.vertices(state)
             state = place_hands(model, hands, cloud, state, body, vertex_normals(body, model.faces))
         for _ in range(steps):
-            weight, pull = _pairs(model, state, samples, surface, share, owner, gate_m, scale_m)
-            state = _step(model, samples, state, weight, pull, components, prior)
+            weight, weighted = _pairs(model, state, samples, surface, share, owner, gate_m, scale_m)
+            state = _step(model, samples, state, weight, weighted, components, prior)
     return state
 
 
@@ -154,7 +154,7 @@ def _pairs(
     gate_m: float,
     scale_m: float,
 ) -> tuple[Array, Array]:
-    """Per sample: 3x3 weights (n, 3, 3) and pulls (n, 3)."""
+    """Information (n, 3, 3) of each sample, and its product with the residual (n, 3)."""
     body = model.vertices(state)
     normals = vertex_normals(body, model.faces)
     mine = samples.indices
@@ -176,9 +176,9 @@ def _pairs(
     robust = area / (1.0 + (residual / scale_m) ** 2) ** 2 / _NOISE_M**2
     metric = along[:, :, None] * along[:, None, :] * (1.0 - _ACROSS) + _ACROSS * np.eye(3)
     weights = robust[:, None, None] * metric
-    pulls = np.einsum("nij,nj->ni", weights, offsets)
+    weighted = np.einsum("nij,nj->ni", weights, offsets)
     total = np.zeros((len(mine), 12))
-    rows = np.concatenate([weights.reshape(-1, 9), pulls], axis=1)
+    rows = np.concatenate([weights.reshape(-1, 9), weighted], axis=1)
     for column in range(12):
         total[:, column] = np.bincount(sample, rows[:, column], len(mine))
     return total[:, :9].reshape(-1, 3, 3), total[:, 9:]
@@ -189,7 +189,7 @@ def _step(
     samples: SampledBody,
     state: BodyState,
     weight: Array,
-    pull: Array,
+    weighted: Array,
     components: int,
     prior: TwistPrior,
 ) -> BodyState:
@@ -198,7 +198,7 @@ def _step(
     size = rows.shape[2]
     flat = rows.reshape(-1, size)
     normal = (flat.T @ (weight.astype(np.float32) @ rows).reshape(-1, size)).astype(np.float64)
-    gradient = (flat.T @ pull.ravel().astype(np.float32)).astype(np.float64)
+    gradient = (flat.T @ weighted.ravel().astype(np.float32)).astype(np.float64)
     shape = shape_parameters(model, active)
     add_shape_prior(state, normal, gradient, shape)
     prior.add(model, state, normal, gradient)

@@ -1,4 +1,4 @@
-"""What the model costs a process: time to load, time to evaluate, memory."""
+"""Resources that the model takes: time to load, time to evaluate, memory."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ _REPEATS = 15
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """How long something took: by the clock, and of this process' processor time (a busy machine
-    shows in the difference)."""
+    """Duration by the clock and in processor time; they differ on a busy machine."""
 
     wall_s: float
     processor_s: float
@@ -32,17 +31,17 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What the model takes in a process of its own."""
+    """Resources that the model takes in a process of its own."""
 
     load: Span
-    """Of the file and of everything that is derived from it."""
+    """Loading the file and deriving everything that depends on it."""
     body: Span
     jacobian: Span
     peak_bytes: int
 
 
 def measure_resources(path: Path | None) -> tuple[Resources, Resources]:
-    """With an empty cache and with the filled one, each in a new process."""
+    """Resources with an empty cache and with a filled one, each in a new process."""
     with tempfile.TemporaryDirectory() as folder:
         return _in_child(path, folder), _in_child(path, folder)
 

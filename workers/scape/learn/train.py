@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.learn.database import PARTS, BodyDatabase
+from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
 from workers.scape.learn.landmarks import find_landmarks
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.learn.skin import separated
@@ -24,10 +24,10 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class TrainingPlan:
-    """How much is learned from how many."""
+    """Numbers of bodies, poses and components, and the seed."""
 
-    bodies: int = 4000
-    poses: int = 1500
+    bodies: int = 1600
+    poses: int = 1000
     components: int = 160
     seed: int = 0
     residual_bodies: int = 60
@@ -101,7 +101,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     }
     save_model(out, fields, metadata)
     progress("pose-dependent deformation", 0.55)
-    pose_fields, twists = learn_pose_fields(load_model(out), database, plan)
+    pose_fields, twists = learn_pose_fields(load_model(out), database, shapes, plan)
     fields.update(_packed_pose_fields(pose_fields))
     fields["twist_mean"] = twists.mean(axis=0)
     fields["twist_covariance"] = np.cov(twists.T)
@@ -142,7 +142,7 @@ def shape_components(
 
 
 def learn_pose_fields(
-    model: BodyModel, database: BodyDatabase, plan: TrainingPlan
+    model: BodyModel, database: BodyDatabase, shapes: Shapes, plan: TrainingPlan
 ) -> tuple[Array, Array]:
     """Q by ridge regression of unposed residual edges on the twists of the joints around.
 
@@ -150,10 +150,10 @@ def learn_pose_fields(
     that were not loosened. The ridge is chosen on a fifth of the poses that the regression did not
     see.
     """
-    shapes = database.sample("train", plan.poses, plan.seed + 1)
     poses = database.sample_poses("train", plan.poses, plan.seed)
     loosened = np.arange(plan.poses) % 2 == 1
     poses[loosened] += _loosening(database, int(loosened.sum()), plan.seed)
+    shapes = shapes.take(np.arange(plan.poses) % len(shapes))
     neutral = database.vertices(shapes)
     posed = database.vertices(shapes, poses)
     twists = np.empty((plan.poses, 3 * (model.part_count - 1)))
