@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from workers.scape.learn.database import BodyDatabase, Split, body_database
+from workers.scape.learn.people.survey import STATURE, WAIST, Regression, surveyed
+from workers.scape.learn.people.tailoring import sizes_of
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
-from workers.scape.learn.survey import STATURE, WAIST, Regression, surveyed
-from workers.scape.learn.tailoring import sizes_of
 from workers.scape.learn.train import TrainingPlan, train
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.cache import FOLDER_VARIABLE

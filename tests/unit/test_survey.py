@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from workers.scape.learn.population import likenesses, population_table
-from workers.scape.learn.survey import (
+from workers.scape.learn.people.population import likenesses, population_table
+from workers.scape.learn.people.survey import (
     COMPARISONS,
     NAMES,
     PUBLIC,

@@ -82,10 +82,10 @@ def population(bodies: int, seed: int) -> None:
     import numpy as np
 
     from workers.scape.learn.database import BodyDatabase
-    from workers.scape.learn.population import population_table
-    from workers.scape.learn.shapes import years_of
-    from workers.scape.learn.survey import Persons
-    from workers.scape.learn.tailoring import sizes_of
+    from workers.scape.learn.people.population import population_table
+    from workers.scape.learn.people.shapes import years_of
+    from workers.scape.learn.people.survey import Persons
+    from workers.scape.learn.people.tailoring import sizes_of
 
     database = BodyDatabase()
     shapes = database.sample("train", bodies, seed)

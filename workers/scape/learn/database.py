@@ -23,11 +23,11 @@ from scipy.spatial import cKDTree
 from station.core.errors import BoothError
 from station.core.geometry import so3_exp
 from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.learn.people.shapes import Shapes, ordinary, random_shapes
+from workers.scape.learn.people.survey import STATURE, WAIST, drawn
+from workers.scape.learn.people.tailoring import Tailor
 from workers.scape.learn.poses import random_poses, survey_posture
-from workers.scape.learn.shapes import Shapes, ordinary, random_shapes
 from workers.scape.learn.skin import outer_skin
-from workers.scape.learn.survey import STATURE, WAIST, drawn
-from workers.scape.learn.tailoring import Tailor
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import signed_volume
 

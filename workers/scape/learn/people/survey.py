@@ -19,15 +19,8 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.measure.definitions import (
-    DEFINITIONS,
-    TRUNK,
-    Definition,
-    Level,
-    Route,
-    Section,
-    Tilted,
-)
+from workers.measure.definitions import DEFINITIONS, TRUNK
+from workers.measure.kinds import Definition, Level, Route, Section, Tilted
 
 Array = NDArray[np.float64]
 
@@ -217,7 +210,7 @@ class Persons:
 @cache
 def surveyed() -> Persons:
     """Everyone who was measured."""
-    path = resources.files("workers.scape.learn").joinpath(SURVEY)
+    path = resources.files("workers.scape.learn.people").joinpath(SURVEY)
     with gzip.open(io.BytesIO(path.read_bytes()), "rt", encoding="ascii") as file:
         rows = list(csv.DictReader(file))
     female = np.array([row["sex"] == "Female" for row in rows])

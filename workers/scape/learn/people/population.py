@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.learn.survey import (
+from workers.scape.learn.people.survey import (
     COMPARISONS,
     PUBLIC,
     STATURE,

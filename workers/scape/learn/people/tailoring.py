@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from station.core.errors import InputError
 from workers.measure.tracing import trace_all
-from workers.scape.learn.shapes import (
+from workers.scape.learn.people.shapes import (
     Shapes,
     base_label,
     is_asymmetric,
     is_of_face,
     ordinary,
 )
-from workers.scape.learn.survey import COMPARISONS, WAIST, Persons, Regression, surveyed
+from workers.scape.learn.people.survey import COMPARISONS, WAIST, Persons, Regression, surveyed
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
