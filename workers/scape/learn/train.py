@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
+from workers.scape.learn.database import PARTS, BodyDatabase, Shapes, body_database
 from workers.scape.learn.landmarks import find_landmarks
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.learn.skin import separated
@@ -55,7 +55,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
         BoothError: the training extra is not installed.
     """
     progress("loading the body generator", 0.0)
-    database = BodyDatabase()
+    database = body_database()
     progress("sampling bodies", 0.02)
     shapes = database.sample("train", plan.bodies, plan.seed)
     bodies = database.vertices(shapes).astype(np.float32)
