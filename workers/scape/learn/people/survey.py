@@ -45,12 +45,15 @@ class Comparison:
     """Excess of the definition here over the survey's, men and women."""
     difference: str = ""
     """Difference of the definitions, in words."""
-    same_mean: bool = True
-    """False where the offset is a guess, so that means say nothing."""
 
     @property
     def name(self) -> str:
         return self.definition.name
+
+    @property
+    def same_mean(self) -> bool:
+        """False where the excess is an estimate, so that means say nothing."""
+        return self.definition_offset_m == (0.0, 0.0)
 
 
 def _row(name: str) -> Definition:
@@ -96,7 +99,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     Comparison(
         _row("chest_breadth"), ("chestbreadth",), (0.055, 0.025),
         "callipers press there; an ellipse of the survey's breadth and depth is a fifth shorter "
-        "than its girth", same_mean=False,
+        "than its girth",
     ),
     Comparison(_row("chest_depth"), ("chestdepth",), (0.012, 0.004), "callipers press"),
     Comparison(
@@ -117,7 +120,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     Comparison(_row("hip_girth"), ("buttockcircumference",)),
     Comparison(
         _row("hip_breadth"), ("hipbreadth",), (0.018, 0.025),
-        "callipers press there, and feet are together", same_mean=False,
+        "callipers press there, and feet are together",
     ),
     Comparison(_row("hip_depth"), ("buttockdepth",)),
     Comparison(
@@ -134,11 +137,11 @@ COMPARISONS: tuple[Comparison, ...] = (
     Comparison(_row("ankle_girth_right"), ("anklecircumference",)),
     Comparison(
         _row("upper_arm_girth_right"), ("bicepscircumferenceflexed",), (-0.028, -0.018),
-        "flexed there, relaxed here", same_mean=False,
+        "flexed there, relaxed here",
     ),
     Comparison(
         _row("forearm_girth_right"), ("forearmcircumferenceflexed",), (-0.012, -0.006),
-        "flexed there, relaxed here", same_mean=False,
+        "flexed there, relaxed here",
     ),
     Comparison(_row("wrist_girth_right"), ("wristcircumference",)),
     Comparison(_row("shoulder_width"), ("biacromialbreadth",)),
@@ -155,7 +158,7 @@ COMPARISONS: tuple[Comparison, ...] = (
     Comparison(
         _row("hand_length_right"), ("handlength",), (0.013, 0.013),
         "from the tip of the radius there; here from the head of the ulna, 10 mm higher, and over "
-        "the knuckles", same_mean=False,
+        "the knuckles",
     ),
     Comparison(_row("foot_length_right"), ("footlength",)),
     Comparison(_row("foot_breadth_right"), ("footbreadthhorizontal",)),
