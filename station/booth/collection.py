@@ -36,7 +36,7 @@ class Collection:
     deadline_s: float
     sets: list[Frameset[LiveFrame]] = field(default_factory=list)
     complete_s: float = 0.0
-    """When its last frameset came."""
+    """Time at which its last frameset came."""
 
     def add(self, found: Frameset[LiveFrame], now_s: float) -> bool:
         """Take a frameset; True when it was the last one."""

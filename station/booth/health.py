@@ -1,4 +1,4 @@
-"""How the booth is, from what its processes wrote of themselves and from the spool.
+"""The booth's state, from its processes' own reports and from the spool.
 
 Needs no process to answer: a hung one is seen by its age. `station status` prints it, control's
 `status` command returns it, and the metrics are made from it.
@@ -26,7 +26,7 @@ class BoothHealth:
     """The booth at one moment."""
 
     processes: dict[str, dict[str, Any]]
-    """What each process said last, with `age_s`; {} of one that said nothing."""
+    """Last report of each process, with `age_s`; {} for a process without a report."""
     sync: dict[str, Any]
     """Cameras, framesets and latencies; {"error"} while sync gives no word."""
     spool: dict[str, int]
@@ -36,7 +36,7 @@ class BoothHealth:
     """Claimed scans that should have ended."""
     free_bytes: int
     problems: list[str] = field(default_factory=list)
-    """What is wrong and what to do, the worst first; empty: all is well."""
+    """Problems with their remedies, the worst first; empty when there are none."""
 
 
 def process_names(config: BoothConfig) -> list[str]:

@@ -17,7 +17,7 @@ from station.messaging.intake import LiveFrame
 
 _STRIDE_PX = 6
 _LOOK_PERIOD_S = 2.0
-"""How often a missing calibration is looked for."""
+"""Period of looking for a missing calibration."""
 
 
 def merged_points(

@@ -1,4 +1,4 @@
-"""How long body scans are kept, and how one is deleted.
+"""Retention of body scans, and the deletion of one.
 
 A wall clock may jump: a dead battery, a mistyped date. So time is counted in a file of the spool
 (`retention.json`): within a boot by the kernel's clock since the boot, from one boot to the next by
@@ -71,7 +71,7 @@ def advance(ages: Ages, now: Moment) -> Ages:
 
 
 def due(ages: Ages, folders: list[str], limits_s: dict[str, float]) -> tuple[Ages, list[str]]:
-    """Which folders ("<state>/<scan id>") are past their time (pure).
+    """Folders ("<state>/<scan id>") that are past their time (pure).
 
     A folder that is seen for the first time begins to age.
     """

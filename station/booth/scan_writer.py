@@ -78,7 +78,7 @@ class ScanWriter:
         self._tasks.put(partial(self._guarded, collection.order, partial(self._write, collection)))
 
     def events(self) -> Iterator[Begun | Ended]:
-        """What has happened since the last call."""
+        """Events since the last call."""
         while True:
             try:
                 yield self._events.get_nowait()

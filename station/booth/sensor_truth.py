@@ -30,7 +30,7 @@ _STEPS = 15
 
 @dataclass(slots=True)
 class CameraTruth:
-    """What one camera's frames say of it. Feed it every frame."""
+    """Plausibility of one camera's frames. Feed it every frame."""
 
     _ticks: int | None = None
     _sequence: int = 0
@@ -67,7 +67,7 @@ class CameraTruth:
         return 1.0 / median(self._steps_s) if len(self._steps_s) == _STEPS else None
 
     def trouble(self, now_s: float) -> str:
-        """What is wrong and what to do, or nothing."""
+        """The problem and its remedy in words; empty when there is none."""
         if now_s - self._trouble_s < _REMEMBERED_S:
             return f"{self._trouble}; unplug the sensor and plug it in again"
         rate_hz = self.rate_hz()
@@ -83,7 +83,7 @@ class CameraTruth:
 
 
 def wrong_sensors(found: dict[str, str], calibrated: dict[str, str]) -> list[str]:
-    """What is wrong with which sensor is which camera: one sentence each.
+    """Sentences about sensors that are not those of the calibration, one each.
 
     Args:
         found, calibrated: camera -> serial number, as it is now and when it was calibrated.

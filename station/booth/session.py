@@ -35,7 +35,7 @@ class Session:
     wanted: int = 0
     reason: str = ""
     path: str = ""
-    """Where its bundle or result lies; empty while it is taken, and when it was moved away."""
+    """Folder of its bundle or result; empty while it is taken, and when it was moved away."""
 
 
 def state_of(note: ScanNote | None, place: str | None) -> State | None:

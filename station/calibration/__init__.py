@@ -1,3 +1,3 @@
-"""Where the cameras are, how this is found out, and how a camera that moved is noticed.
+"""Finding the cameras' places and depth errors, and noticing a camera that moved.
 The calibration file itself is `station.core.rig`.
 """

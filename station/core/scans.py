@@ -67,7 +67,7 @@ def boot_id() -> str:
 
 @dataclass(frozen=True, slots=True)
 class ScanNote:
-    """What is noted of one scan."""
+    """Note of one scan."""
 
     scan_id: ScanId
     stage: Stage
@@ -80,11 +80,11 @@ class ScanNote:
     result: str = ""
     """Name under `tmp/` of the result that is being delivered."""
     verdict: str = ""
-    """What the result says: "ok" or "rescan"."""
+    """Verdict of the result: "ok" or "rescan"."""
     tries: int = 0
     """Reconstructions that ended badly by themselves."""
     deaths: int = 0
-    """How often a worker's process ended meanwhile: no fault of the scan's, most likely."""
+    """Number of workers' processes that ended meanwhile; most likely no fault of the scan."""
 
 
 class Notes:

@@ -159,7 +159,7 @@ def file_name(process: str) -> str:
 
 
 def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
-    """What a process said of itself last, with `age_s`, the seconds since; empty if nothing."""
+    """Last report of a process, with `age_s`, the seconds since; empty if there is none."""
     path = runtime_folder / HEALTH / f"{file_name(process)}.json"
     try:
         content = read_small(path, _MOST_HEALTH_BYTES)

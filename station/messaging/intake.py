@@ -1,4 +1,4 @@
-"""What the capture processes publish, as it comes: frames, and what cameras say of themselves.
+"""Intake of the capture processes' messages: frames, and the cameras' health.
 
 A message that cannot be read is counted and dropped, whoever sent it: a capture process of another
 release must not end its readers.
@@ -48,9 +48,9 @@ class FrameIntake:
         self.health: dict[str, CameraHealth] = {}
         self.sensors: dict[str, SensorInfo] = {}
         self.last_frame_s: dict[str, float] = {}
-        """When the last frame of a camera came, host's monotonic clock."""
+        """Arrival of each camera's last frame, host's monotonic clock."""
         self.told_s: dict[str, float] = {}
-        """When a camera's process last said anything."""
+        """Arrival of the last message of each camera's process."""
         self.unreadable = 0
         self.last_problem = ""
 
@@ -79,7 +79,7 @@ class FrameIntake:
         )
 
     def why(self, camera: str) -> str:
-        """What a camera's process says of why it gives no frames, in brackets, or nothing."""
+        """Reason in brackets that a camera's process gives for missing frames; may be empty."""
         health = self.health.get(camera)
         return f" ({health.detail or health.state})" if health else ""
 

@@ -26,7 +26,7 @@ _KINDS: dict[str, type | tuple[type, ...]] = {
     "list[list[float]]": list,
     "dict[str, Any]": dict,
 }
-"""What msgpack may give for a field; annotations are strings here."""
+"""Types that msgpack may give for a field; annotations are strings here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Message:
         return message
 
     def impossible(self) -> str | None:
-        """Which value cannot be, beyond its type; None if all can."""
+        """Name of a value that is impossible beyond its type; None if there is none."""
         return None
 
 
@@ -106,12 +106,12 @@ class FrameHeader(Message):
     device_ticks: int
     tick_hz: float
     host_time_s: float
-    """When it was taken, host's monotonic clock, by the clock model."""
+    """Time at which it was taken: the host's monotonic clock, by the clock model."""
     received_s: float
-    """When it reached the host, same clock."""
+    """Time at which it reached the host, same clock."""
     sequence: int
     clock_resets: int
-    """How often the sensor's clock was reset: times before and after have nothing in common."""
+    """Resets of the sensor's clock so far: times before and after one have nothing in common."""
 
     def impossible(self) -> str | None:
         if not (0 < self.width <= _MOST_PIXELS and 0 < self.height <= _MOST_PIXELS):
@@ -125,7 +125,7 @@ class FrameHeader(Message):
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth(Message):
-    """What a capture process says of its sensor, twice a second."""
+    """The state of a sensor, sent by its capture process twice a second."""
 
     camera: str
     state: str
@@ -186,7 +186,7 @@ class Reply(Message):
 
 @dataclass(frozen=True, slots=True)
 class ScanEvent(Message):
-    """How far a scan is. The verdict is on disk too; who missed it here asks control."""
+    """Progress of a scan. The verdict is on disk too; a program that missed it asks control."""
 
     scan_id: str
     state: str

@@ -14,11 +14,11 @@ class Topic:
     """One kind of published message."""
 
     rate_hz: float
-    """How often its sender publishes it."""
+    """Rate at which its sender publishes it."""
     max_age_s: float
     """Without a new one for so long, its sender is named as silent."""
     high_water_mark: int
-    """How many wait for a slow reader; more are lost."""
+    """Most messages that wait for a slow reader; more are lost."""
 
 
 TOPICS = {

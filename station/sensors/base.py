@@ -18,7 +18,7 @@ class DeviceInfo:
     """A sensor as it was opened."""
 
     serial: str
-    """What the sensor says of itself; a recording has a name with a colon instead."""
+    """Serial number as the sensor reports it; a recording has a name with a colon instead."""
     model: str
     width: int
     height: int
@@ -47,7 +47,7 @@ class DepthFrame:
     """(height, width) in units of ``DeviceInfo.depth_scale_m``; 0 = no reading."""
     device_ticks: int
     received_s: float
-    """When it reached the host, host's monotonic clock."""
+    """Time at which it reached the host, on the host's monotonic clock."""
     sequence: int
     """Counts the frames that the sensor delivered; a gap is a loss."""
 

@@ -44,7 +44,7 @@ class DeviceClock:
 
     @property
     def drift(self) -> float | None:
-        """How much faster the host's clock runs, a share; None within the first seconds."""
+        """Relative rate of the host's clock against the device's; None within the first seconds."""
         if len(self._envelope) < 2:
             return None
         (x0, y0), (x1, y1) = self._envelope[0], self._envelope[-1]

@@ -1,4 +1,4 @@
-"""What a structured-light Kinect v1 does to a true depth image.
+"""The errors of a structured-light Kinect v1 on a true depth image.
 
 Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
 and fly: Nguyen, Izadi & Lovell 2012. (What reads the images assumes the other published law, that
@@ -37,20 +37,20 @@ def raw_from_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 @dataclass(frozen=True, slots=True)
 class TrueView:
-    """What a perfect sensor would see, (h, w) each."""
+    """View of a perfect sensor, (h, w) each."""
 
     depth_m: Image
     """Distance along the optical axis; 0 = nothing."""
     incidence_rad: Image
     lit: NDArray[np.bool_]
-    """Where the projector's light arrives."""
+    """Mask of the pixels that the projector's light reaches."""
     reflects: NDArray[np.bool_]
     """False on dark hair or underwear, which give no reading."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Where a part of an image lies in the whole."""
+    """Place of a part of an image in the whole."""
 
     top: int
     left: int
@@ -65,7 +65,7 @@ class UnitError:
     bias_m: float = 0.0
     """Its size at 2 m, growing with z^2."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """How much it changes over the image, relative, per half width and half height."""
+    """Relative change of it over the image, per half width and half height."""
     gain: float = 0.0
     """Relative error of all inverse depths: a baseline or a focal length that is not quite so."""
     curvature: float = 0.0
@@ -99,7 +99,7 @@ def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class NoiselessView:
-    """What one unit would read of a view without its noise, (h, w) each."""
+    """Readings of one unit without noise, (h, w) each."""
 
     depth_m: Image
     seen: NDArray[np.bool_]
@@ -109,7 +109,7 @@ class NoiselessView:
 
     @classmethod
     def of(cls, view: TrueView, unit: UnitError, window: Window | None = None) -> NoiselessView:
-        """Of a part of the image where a window is given."""
+        """Readings of a view, or of the part of it in a window."""
         depth = unit.apply(view.depth_m, window)
         return cls(
             depth_m=depth,

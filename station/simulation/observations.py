@@ -34,7 +34,7 @@ _LOOK_S = 1.0
 
 
 def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observations:
-    """What one camera contributes: the ball's way and resting places, floor, boards."""
+    """Observations of one camera: the ball's path and resting places, floor, boards."""
     name = camera.name
     index = list(procedure.booth.rig.cameras).index(name)
     rng = np.random.default_rng((procedure.booth.seed, index, 4))

@@ -37,13 +37,13 @@ _BOARD_THICK_M = 0.02
 
 @dataclass(frozen=True)
 class VirtualProcedure:
-    """What the cameras see of a calibration; the same seed gives the same frames."""
+    """A virtual calibration as the cameras see it; the same seed gives the same frames."""
 
     booth: SimulatedBooth = field(default_factory=SimulatedBooth)
     radius_m: float = 0.1
     waving_s: float = 60.0
     front_m: float = 0.5
-    """How far in front of the mark the ball rests the second time."""
+    """Distance in front of the mark at which the ball rests the second time."""
     board_at_m: tuple[float, ...] = (-0.6, -0.2, 0.2, 0.6)
     """y of the board's middle at each of its places."""
     around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
@@ -60,7 +60,7 @@ class VirtualProcedure:
         return (EMPTY, BALL, MARK, FRONT, *walls, *around)
 
     def starts_s(self, step: str) -> float:
-        """When a step begins, true time."""
+        """True time at which a step begins."""
         start_s = 0.0
         for other in self.steps:
             if other == step:
@@ -101,7 +101,7 @@ class VirtualProcedure:
             yield VirtualFrame(time_s, unit.ticks(time_s), sequence, raw)
 
     def ball_center_m(self, time_s: float) -> Array:
-        """Where the waved ball truly is, world frame."""
+        """True centre of the waved ball, world frame."""
         return self._path.at(time_s - self.starts_s(BALL))
 
     def _lasts_s(self, step: str) -> float:
@@ -113,7 +113,7 @@ class VirtualProcedure:
         )
 
     def _still(self, camera: str, board_y_m: float | None) -> TrueView:
-        """What does not move; most steps share it."""
+        """View of everything that does not move; most steps share it."""
         if (camera, board_y_m) not in self._views:
             meshes = self.booth.fixtures
             if board_y_m is not None:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _SHADOW_TOLERANCE_M = 1e-4
 _MARGIN_PX = 14
-"""What moves flickers at its edges and casts noise of its own: a little more is drawn anew."""
+"""Margin around moving objects that is drawn anew: their edges flicker."""
 
 
 @dataclass(frozen=True, slots=True)

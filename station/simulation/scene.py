@@ -26,7 +26,7 @@ _SHADOW_TOLERANCE_M = 0.01
 _BUMP_M = 0.1
 _BUMP_WAVES = 100
 _BUMP_HALVINGS = 6
-"""Of a box's edges: a floor's triangles come to 66 mm."""
+"""Number of times a box's edges are halved: a floor's triangles come to 66 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +215,7 @@ class VirtualScene:
         )
 
     def view(self, camera: CameraCalibration, world_from_camera: Array) -> TrueView:
-        """What a perfect sensor at a pose would see; lens distortion is not simulated."""
+        """View of a perfect sensor at a pose; lens distortion is not simulated."""
         height, width = camera.height, camera.width
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         K = camera.K

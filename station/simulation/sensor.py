@@ -37,13 +37,13 @@ _FACTORY_SIGMA = (3e-4, 1.5e-3)
 
 @dataclass(frozen=True, slots=True)
 class SimulatedBooth:
-    """What can go right and wrong in a virtual booth; the defaults are an ordinary day."""
+    """Conditions in a virtual booth; the defaults are an ordinary day."""
 
     rig: Rig = field(default_factory=default_rig)
     """The calibration that the station believes."""
     seed: int = 0
     sway_m: float = 0.002
-    """How far the head moves to either side, in a period of three seconds."""
+    """Motion of the head to either side, with a period of three seconds."""
     bias_m: float = 0.0
     """Size of each unit's systematic depth error at 2 m."""
     drop_rate: float = 0.0
@@ -57,11 +57,11 @@ class SimulatedBooth:
     walls: bool = True
     uneven_floor_m: float = 0.0
     uneven_board_m: float = 0.0
-    """How far its floor, and a board that is held up in it, are off flat."""
+    """Unevenness of its floor, and of a board held up in it."""
 
     @property
     def fixtures(self) -> list[Mesh]:
-        """What stands in it beside the person."""
+        """Objects in it beside the person."""
         if not self.walls:
             return [*self.clutter]
         floor, *walls = booth_walls()
@@ -81,7 +81,7 @@ class VirtualFrame:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedUnit:
-    """What distinguishes one sensor from the next of its kind."""
+    """Individual errors of one sensor."""
 
     error: UnitError
     drift: float
@@ -134,7 +134,7 @@ class VirtualCamera:
             yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
 
     def _view(self, time_s: float) -> TrueView:
-        """What a perfect sensor would see at a time, rendered once for each lean."""
+        """View of a perfect sensor at a time, rendered once for each lean."""
         booth, camera = self._booth, self._camera
         turns = time_s / _SWAY_PERIOD_S + self._sway_phase
         sway_m = 0.0 if self._body is None else booth.sway_m

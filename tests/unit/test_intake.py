@@ -1,4 +1,4 @@
-"""What strangers publish ends no reader."""
+"""Messages of strangers end no reader."""
 
 from __future__ import annotations
 

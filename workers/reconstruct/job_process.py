@@ -21,7 +21,7 @@ from station.core.errors import BoothError
 from station.core.service import die_with_parent, set_up_caches
 
 MEMORY_BYTES = 2 << 30
-"""What a job may allocate; a usual one takes a third of it."""
+"""Memory that a job may allocate; a usual one takes a third of it."""
 
 
 def _say(channel: int, message: dict[str, Any]) -> None:

@@ -22,16 +22,16 @@ _LOOK_S = 0.2
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
 Blame = Literal["scan", "job", "station", "disk", "nobody"]
-"""Who caused a bad end: the scan cannot be used; the job crashed or hung; something outside ended
+"""Cause of a bad end: the scan cannot be used; the job crashed or hung; something outside ended
 the process; the disk refused; the station is being stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a job ended."""
+    """The end of a job."""
 
     status: str = ""
-    """What the result says ("ok" or "rescan"); empty: there is none."""
+    """Verdict of the result ("ok" or "rescan"); empty if there is none."""
     reason: str = ""
     """Why to scan again, or why there is no result."""
     blame: Blame = "nobody"

@@ -109,7 +109,7 @@ class Worker:
         self._spare = JobProcess()
 
     def _settle(self, claim: Claim, outcome: Outcome) -> None:
-        """What becomes of a scan without a result."""
+        """Settle a scan that ended without a result."""
         if outcome.blame == "nobody":
             claim.put_back()
             return

@@ -1,3 +1,3 @@
-"""What one camera sees of a ball, a board, the floor and the empty booth, reduced to measurements.
+"""Detections by one camera of a ball, a board, the floor and the empty booth.
 Nothing here knows of a second camera.
 """

@@ -1,4 +1,4 @@
-"""Which pixels of a ball are not the ball's alone: hands and fingers hold it."""
+"""Pixels of a ball that show a hand or fingers as well."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _STRAY_SIGMAS = 3.0
 _STRAY_CLIP = 12.0
 _STRAY_COSINE = 0.4
 _RING = (1.1, 1.25)
-"""Of the radius: outside the flickering silhouette, where one sees what holds the ball."""
+"""Ring, in radii, outside the flickering silhouette: it shows what holds the ball."""
 _FINGERS_M = 0.055
-"""How far fingers of 8 cm, bent round a ball, are seen to reach from the hand."""
+"""Visible reach of fingers of 8 cm, bent round a ball, from the hand."""
 _FINGERS_SHOW_M = 1.7
 """Up to here a finger is as wide as the mean that shows strays, and stands out by its limit."""
 

@@ -24,7 +24,7 @@ from station.core.rig import CameraCalibration, Rig
 Array = NDArray[np.float64]
 
 WORKING_DISTANCE_M = 1.7
-"""Where the person stands, from a camera."""
+"""Distance of the person from a camera."""
 _LEAST_CORNERS = 8
 _LEAST_MARKERS = 4
 _LEAST_VIEWS = 12
@@ -42,7 +42,7 @@ _FIXED = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGE
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """What is printed: squares across and down, their size, the markers in them."""
+    """The printed board: squares across and down, their size, the markers in them."""
 
     columns: int
     rows: int
@@ -94,7 +94,7 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class LensReport:
-    """What a camera's views say of its lens."""
+    """The lens of a camera as judged by its views of the board."""
 
     camera: str
     views: int
@@ -251,7 +251,7 @@ def _placed(
 
 
 def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
-    """How far two lenses put what a pixel sees apart at the working distance, 95th percentile."""
+    """Distance of two lenses' points of a pixel at the working distance, 95th percentile."""
     u, v = np.meshgrid(np.linspace(0, one.width - 1, 17), np.linspace(0, one.height - 1, 13))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     ahead = [pixel_rays(camera, pixels) for camera in (one, other)]
@@ -262,7 +262,7 @@ def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TieReport:
-    """How well a calibration carries the board from one camera to another."""
+    """Errors with which a calibration carries the board from one camera to another."""
 
     pairs: Mapping[tuple[str, str], float]
     """Rms distance between the two cameras' places of the board's corners, metres."""

@@ -28,7 +28,7 @@ _HEIGHT_M = (0.15, 3.5)
 _INCIDENCE_COSINE = 0.26
 """75 degrees: a camera at hip height sees the floor at a slant, if at all."""
 _UNEVEN_FLOOR_M, _UNEVEN_BOARD_M = 5e-4, 2e-4
-"""How far what is built and what is made are off flat, rms (DIN 18202 lets a finished floor be off
+"""Unevenness of floors and of boards, rms (DIN 18202 lets a finished floor be off
 by 2 mm over 0.1 m), ..."""
 _BUMP_M2 = 2.0 * np.pi * 0.1**2
 """... in bumps of this size: what one camera sees of a bump errs all alike."""
@@ -40,7 +40,7 @@ _FARTHEST_M = 3.2
 _WHOLE_PX = 3
 _LEAST_WHOLE = 2
 _LEAST_WHOLE_SHARE = 0.6
-"""Where more frames have gaps, what lies between the gaps is too near as well."""
+"""Least share of frames without a gap: with more gaps, the readings between them are too near."""
 
 
 def observe_floor(

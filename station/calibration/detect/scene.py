@@ -1,4 +1,4 @@
-"""What a camera sees of the empty booth: the floor and whatever always stands there.
+"""One camera's view of the empty booth: the floor and whatever always stands there.
 
 Kept with each calibration. The drift check compares later frames with it, and the ball is looked
 for in front of it. Everything is in inverse depth, in which a structured-light sensor's noise is

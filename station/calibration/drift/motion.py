@@ -47,7 +47,7 @@ _STRIDE_PX = 8
 _CORRELATION = 2.5
 """... their variances sum to this much more, of a blur of 3.4 px (the sensor's window, ours)."""
 _FLOOR_PER_M = 2e-5
-"""What averaging does not take away (quantisation), 1/m; 0.3 mm at 3.7 m."""
+"""Noise that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
 _WIDE_PX = 10.0
 """Slopes of smooth surfaces are taken over this width: noise in them would pass for structure."""
 _EDGE_PER_M_PX = 0.008
@@ -73,7 +73,7 @@ _HUBER, _TUKEY = 1.345, 4.685
 
 @dataclass(frozen=True, slots=True)
 class CameraMove:
-    """How far a camera stands off its calibration, as its background tells."""
+    """The motion of a camera since its calibration, estimated from its background."""
 
     camera: str
     xi: Array
@@ -108,7 +108,7 @@ class CameraMove:
         return list(directions.T[hidden])
 
     def words(self) -> str:
-        """What the operator should know, in one sentence."""
+        """One sentence for the operator."""
         if self.lost:
             return (
                 f"camera {self.camera} no longer sees what it saw when it was calibrated "
@@ -297,7 +297,7 @@ def _align(
 
 
 def _weights(off: Array, convex: bool) -> Array:
-    """Of deviations in standard deviations: Huber's first, then Tukey's.
+    """Weights of deviations in standard deviations: Huber's first, then Tukey's.
 
     Few samples see some directions (the floor: up and down); what most of them call an outlier at
     the start may be what they tell.

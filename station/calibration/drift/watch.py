@@ -27,7 +27,7 @@ class DriftWatch:
     def moves(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
     ) -> list[CameraMove]:
-        """How far a camera stands off, by frames of one moment; none where nothing was stored.
+        """Motion of a camera by frames of one moment; empty if no background was stored.
 
         Raises:
             CalibrationError: the camera's images are of another size than when it was calibrated.

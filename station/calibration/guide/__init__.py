@@ -1,3 +1,3 @@
-"""What leads an operator through a calibration: frames, steps, what is kept on disk.
+"""The guided calibration: frames, steps, the operator's screen, and the session on disk.
 The mathematics is in `detect` and `solve`.
 """

@@ -36,7 +36,7 @@ from station.sensors.recording import check_recording
 
 _POLL_S = 0.05
 _LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
-"""How many frames wait to be taken; each is 0.6 MB."""
+"""Most frames that wait to be taken; each is 0.6 MB."""
 _STOP_S = 5.0
 _GATHER_S = 20.0
 
@@ -51,7 +51,7 @@ class TimedFrame:
     """(height, width) in units of scale_m, 0 = no reading."""
     scale_m: float
     clock_resets: int = 0
-    """How often the camera's clock had been reset."""
+    """Number of resets of the camera's clock so far."""
 
     def depth_m(self) -> NDArray[np.float32]:
         return self.depth.astype(np.float32) * np.float32(self.scale_m)
@@ -76,7 +76,7 @@ class RecordedClock:
         """Frames of it that did not come, so far."""
 
     def time_s(self, header: FrameHeader) -> float | None:
-        """When a frame was taken, or None where the recording has begun anew."""
+        """Time at which a frame was taken; None when the recording has begun anew."""
         found = self._frames.get(header.device_ticks)
         if found is None:
             raise CalibrationError(

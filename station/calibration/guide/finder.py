@@ -57,7 +57,7 @@ class BallFinder:
                 self._pending.append(self._pool.submit(self._find, frame))
 
     def found(self, *, wait: bool = False) -> list[BallDetection]:
-        """What was found since the last call, in the order of the frames."""
+        """Detections since the last call, in the order of the frames."""
         balls = []
         while self._pending and (wait or self._pending[0].done()):
             ball = self._pending.popleft().result()

@@ -1,4 +1,4 @@
-"""What the operator of a calibration sees, hears and presses. He may be alone in the booth."""
+"""Screen, sounds and keys of the operator of a calibration, who may be alone in the booth."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Guide:
         self.progress(f"now{_BELL}", now=True)
 
     def title(self, text: str) -> None:
-        """What begins now."""
+        """Announce a step."""
         self.end_line()
         click.echo(f"\n{text}")
 
@@ -69,7 +69,7 @@ class Guide:
         return self.attended and click.confirm(f"  {question}", default=True)
 
     def end_line(self) -> None:
-        """What follows begins on a line of its own."""
+        """End the current line, so that the next text begins on its own."""
         if self._open_line:
             click.echo()
             self._open_line = False

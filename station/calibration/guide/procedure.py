@@ -1,4 +1,4 @@
-"""What an operator is led through to calibrate a booth, step by step, up to the solution in use."""
+"""The calibration procedure, step by step, up to the solution in use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from station.core.errors import CalibrationError
 _SENSORS_S = 20.0
 _MOST_BOARDS, _MOST_PLACES = 20, 20
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
-"""Where the ball is laid: three places away from one line show the floor's slope both ways."""
+"""Places of the ball: three that are not on one line show the floor's slope in both directions."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,7 +62,7 @@ class Session:
     lenses: dict[str, Lens] = field(default_factory=dict)
     runs: int = 0
     _later_s: float | None = 0.0
-    """What this run's times are moved by; None until its first detection."""
+    """Shift of this run's times; None until its first detection."""
 
     @classmethod
     def begin(
@@ -122,7 +122,7 @@ class Session:
         }
 
     def observations(self) -> Observations:
-        """What the calibration is solved from."""
+        """The observations that the calibration is solved from."""
         planes = [plane for seen in self.planes.values() for plane in seen]
         return Observations(self.balls, self.mark, self.front, planes, self.around)
 
@@ -135,7 +135,7 @@ class Session:
         return step in self.planes
 
     def summary(self) -> str:
-        """What was seen so far, in words."""
+        """The session so far, in words."""
         parts = {
             "the empty booth": self.done(EMPTY),
             f"{len(self.balls)} sightings of the waved ball": bool(self.balls),

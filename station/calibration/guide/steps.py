@@ -149,7 +149,7 @@ def _at_rest(seen: list[BallDetection]) -> bool:
 
 
 def covered(session: Session, reference: str) -> Coverage:
-    """What has been seen of the waved ball so far."""
+    """Coverage by the waved ball so far."""
     coverage = Coverage(session.lensed_cameras(), reference)
     for ball in session.balls:
         coverage.add(ball)

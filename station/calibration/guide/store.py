@@ -61,7 +61,7 @@ class CalibrationStore:
 
     @property
     def unfinished(self) -> Path:
-        """Where the calibration that is being done keeps what it has seen."""
+        """Folder of the session of the unfinished calibration."""
         return self.folder / UNFINISHED
 
     def entries(self) -> list[Entry]:

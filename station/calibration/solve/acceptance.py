@@ -22,16 +22,16 @@ Array = NDArray[np.float64]
 _BLOCK_S = 1.0
 _EVERY = 5
 LARGEST_RMS_M = 0.006
-"""Of single detections, whose own noise is 1-2 mm."""
+"""Largest rms of single detections, whose own noise is 1-2 mm."""
 LARGEST_MEAN_M = 0.0025
-"""Of a camera's held-out detections together, where the noise averages out."""
+"""Largest mean of a camera's held-out detections, in which the noise averages out."""
 _LEAST = 6
 """Fewer comparisons prove nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """How far one camera's held-out detections lie from where the others saw the ball."""
+    """Distances of one camera's held-out detections from the ball as the others saw it."""
 
     detections: int
     rms_m: float
@@ -50,7 +50,7 @@ class HeldOut:
 
 
 def held_out(times_s: Array, start_s: float) -> NDArray[np.bool_]:
-    """Which times (n,) fall into a held-out second."""
+    """Mask of the times (n,) that fall into a held-out second."""
     return ((times_s - start_s) / _BLOCK_S).astype(np.int64) % _EVERY == _EVERY - 1
 
 
@@ -83,7 +83,7 @@ def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
 
 
 def overall_rms(found: Mapping[str, HeldOut]) -> float:
-    """Of all cameras' held-out detections."""
+    """Rms distance over all cameras' held-out detections."""
     count = sum(one.detections for one in found.values())
     return float(
         np.sqrt(sum(one.detections * one.rms_m**2 for one in found.values()) / max(count, 1))

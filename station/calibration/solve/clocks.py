@@ -180,7 +180,7 @@ def _lateness(a: Track, b: Track) -> tuple[Array, Array, Array]:
 
 
 def _step(measured: tuple[Array, Array, Array], cut_s: float) -> tuple[float, float] | None:
-    """How much later after the cut than before, and its standard deviation."""
+    """Step of the clock at the cut, and its standard deviation."""
     times, pulled, known = measured
     early = times < cut_s
     if min(_seen_s(times[side]) for side in (early, ~early)) < _LEAST_ON_A_SIDE_S:

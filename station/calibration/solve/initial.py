@@ -65,7 +65,7 @@ def sorted_detections(
 
 
 def confirmed(detections: Mapping[str, Detections], poses: Mapping[str, Array]) -> dict[str, Mask]:
-    """Which detections at least one other camera agrees with."""
+    """Detections with which at least one other camera agrees."""
     in_reference = {
         name: Track(own.track.times_s, transform(poses[name], own.track.points))
         for name, own in detections.items()
@@ -86,7 +86,7 @@ def confirmed(detections: Mapping[str, Detections], poses: Mapping[str, Array]) 
 def at_rest(
     detections: Sequence[BallDetection], camera: CameraCalibration, radius_m: float
 ) -> Sightings | None:
-    """What a camera saw of a ball that rests: those that agree with their median."""
+    """A camera's detections of a resting ball that agree with their median."""
     own = sorted_detections(detections, [camera.name], radius_m)[camera.name]
     if len(own.waved) < _LEAST_AT_REST:
         return None
@@ -140,7 +140,7 @@ def _one_plane(view: tuple[Array, float], other: tuple[Array, float]) -> bool:
 def resting_places(
     resting: Mapping[str, Sequence[Sightings]], poses: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Where the ball rested (3,), reference frame: the mean of what the cameras saw."""
+    """Places (3,) of the resting ball in the reference frame: the mean over the cameras."""
     return {
         place: np.mean(
             [transform(poses[s.camera], s.centers.mean(axis=0)) for s in sightings], axis=0
@@ -150,7 +150,7 @@ def resting_places(
 
 
 def spread_m(centers: Array) -> float:
-    """How far resting balls (n, 3) lie from one line, rms: nothing shows a floor's slope else."""
+    """Rms distance of resting balls (n, 3) from one line; without it a floor's slope is unknown."""
     away = centers - centers.mean(axis=0)
     return float(np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(away))[1], 0.0)))
 

@@ -39,20 +39,20 @@ _SETTLED = 0.01
 CLOCK_TOLERANCE_S = 0.005
 """Standard deviation of one camera's clock against another's, before it is solved for."""
 CONTACT_M = 0.0005
-"""How evenly a ball rests on a floor."""
+"""Standard deviation of a resting ball's height above the floor."""
 TREMOR_M = 2e-4
 """By which a hand is off a path that bends every tenth of a second, along each axis."""
 _TAIL = 4.0
-"""Of the prior of depth corrections: Student's t with about so many degrees of freedom."""
+"""Degrees of freedom of the prior of depth corrections (Student's t)."""
 _NEAR_M = 0.05
 """Depth errors that are not corrected yet shift a ball along its ray, by less than that."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
 _LEAST_TYPICAL = 0.2
-"""Of the noise's variance."""
+"""Least value of the noise's variance factor."""
 MEDIAN = 2.366
-"""Of the squared deviation of three numbers."""
+"""Median of the squared deviation of three numbers."""
 
 
 def local_equations(
@@ -290,7 +290,7 @@ class _Equations:
 
 
 def _near(centers: Array, detected: Array) -> Array:
-    """Where to linearise (n, 3): as far as the centres, but where the rays meet the ball.
+    """Points of linearisation (n, 3): at the centres' distance, on the rays of the detections.
 
     What is seen of a ball says nothing of how well a place decimetres away agrees with it.
     """

@@ -1,4 +1,4 @@
-"""What a calibration is solved from, as arrays, and the unknowns that are to agree with it."""
+"""The calibration problem: observations as arrays, and the unknowns that explain them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 FOOT = 7
-"""Of a camera's unknowns, pose (6) and clock (1) come before the depth correction."""
+"""Unknowns of a camera before its depth correction: pose (6) and clock (1)."""
 PER_CAMERA = FOOT + depth_correction.PARAMETERS
 
 
@@ -98,7 +98,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What is to be brought into agreement."""
+    """Observations that the solution must explain."""
 
     cameras: Mapping[str, CameraCalibration]
     reference: str
@@ -116,18 +116,18 @@ class State:
     poses: Mapping[str, Array]
     """reference_from_camera, 4x4."""
     clock_s: Mapping[str, float]
-    """What is added to a camera's times."""
+    """Offset added to a camera's times, seconds."""
     corrections: Mapping[str, Array]
     """(5,) each, ``depth_correction``'s parameters."""
     grid: TimeGrid
     controls: Array
     """(count, 3) of the ball's path."""
     places: Mapping[str, Array]
-    """Where the ball rested, (3,)."""
+    """Places (3,) of the resting ball."""
     planes: Mapping[str, Array]
     """q (3,) of q . X = 1."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Of the border's unknowns, by ``Layout``."""
+    """Covariance of the border's unknowns, by ``Layout``."""
     deviations: Mapping[str, Array] = field(default_factory=dict)
     """Squared deviation (n,) of each waved detection's centre in units of its noise."""
     scale: float = 1.0
@@ -138,10 +138,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the border's unknowns stand."""
+    """Positions of the border's unknowns."""
 
     starts: Mapping[str, int]
-    """Of each camera, place and plane; the reference camera has its depth correction alone."""
+    """First index of each camera, place and plane; the reference has its depth correction alone."""
     size: int
     reference: str
 

@@ -1,4 +1,4 @@
-"""What must not become a calibration, and what the operator reads: the cause and the remedy."""
+"""Refusals of a calibration, and the operator's messages: the cause and the remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from station.core.errors import CalibrationError
 Array = NDArray[np.float64]
 
 _RADIUS_SHARE = 0.04
-"""How far the measured radius may lie from the given one; a depth error of 1 % moves it by 1 %."""
+"""Largest relative error of the measured radius; a depth error of 1 % changes it by 1 %."""
 _LEAST_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
 _LARGEST_SIGMA_M = 0.002

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _LEAST_SPREAD_M = 0.15
-"""Of the places where the ball rested, from one line, where no camera sees the floor."""
+"""Least distance of the ball's places from one line, when no camera sees the floor."""
 _GOOD_SLOPE_RAD = np.radians(0.06)
 
 
@@ -51,14 +51,14 @@ class Solution:
     """Poses with the covariance between cameras."""
     held_out: Mapping[str, HeldOut]
     weak: tuple[str, ...]
-    """What could be better, and how; empty where nothing need be."""
+    """Possible improvements, in words; may be empty."""
     clock_s: Mapping[str, float]
     """Offset of each camera's clock against the reference's."""
     radius_m: float
     """The ball's, as all cameras measured it."""
 
     def summary(self) -> list[str]:
-        """What the operator is told."""
+        """Lines for the operator."""
         rms_mm = 1e3 * self.rig.residual_rms_m
         lines = [f"tested on every fifth second: {rms_mm:.1f} mm rms between cameras"]
         for name, one in self.held_out.items():

@@ -29,7 +29,7 @@ class Placed:
     covariance: Array
     """(6 n, 6 n) of all cameras' xi in world_from_camera @ se3_exp(xi), in their order."""
     mark_height_m: float
-    """Of the resting ball's centre above the floor."""
+    """Height of the resting ball's centre above the floor."""
     slope_sigma_rad: float
     """Largest standard deviation of the floor's slope, as the reference camera sees it."""
 

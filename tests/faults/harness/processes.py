@@ -47,7 +47,7 @@ class Scans:
             time.sleep(0.2)
 
     def row(self, fault: str) -> Row:
-        """What was said against what lies on disk."""
+        """Statements of the station, compared with the folders on disk."""
         spool = self._config.spool.folder
         kept = {
             state: {p.name for p in (spool / state).iterdir()} for state in ("outbox", "failed")
@@ -178,7 +178,7 @@ def full_disk_rows(station: Station) -> list[Row]:
 
 
 def memory_slopes(station: Station, seconds: float) -> list[Row]:
-    """How the processes' memory and descriptors grow while scans are taken."""
+    """Growth of the processes' memory and descriptors while scans are taken."""
     scans = Scans(station, load_config(station.config))
     before = _sizes(station)
     began_s = time.monotonic()

@@ -24,7 +24,7 @@ _OFF_SURFACE_M = 1e-4
 _STEP_M = 1e-4
 _MOST_STEPS = 60
 _BEND = 0.3
-"""What bending by one radian costs, against the triangles' area, when a gap is closed."""
+"""Cost of bending by one radian, against the triangles' area, when a gap is closed."""
 
 Edges = NDArray[np.int64]
 

@@ -194,7 +194,7 @@ _UNUSUAL = 0.15
 """Share of persons whose deviations are wider, so that the model reaches who is outside."""
 _UNUSUAL_SCALE = 1.6
 _SPLITS = {"train": (0, 14), "validation": (14, 17), "test": (17, 20)}
-"""Which of every twenty persons of the survey serve which split."""
+"""Persons of every twenty of the survey that serve each split."""
 
 
 @dataclass(frozen=True, slots=True)
