@@ -9,7 +9,8 @@ from typing import Generic, TypeVar
 
 Frame = TypeVar("Frame")
 
-_LONGEST_QUEUE = 8
+_LONGEST_QUEUE = 20
+"""Two thirds of a second: frames of one camera may come half a second after those of the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,11 @@ class FramesetMatcher(Generic[Frame]):
     def push(self, camera: str, time_s: float, frame: Frame) -> list[Frameset[Frame]]:
         """Add a frame; returns the sets that it completes."""
         queue = self._queues[camera]
-        if queue and time_s <= queue[-1][0]:
+        if queue and time_s == queue[-1][0]:
+            # The same frame once more.
+            self.dropped[camera] += 1
+            return []
+        if queue and time_s < queue[-1][0]:
             # A clock that was reset, or a replay that began anew: what waited is of the past.
             self.dropped[camera] += len(queue)
             queue.clear()

@@ -57,3 +57,41 @@ def test_a_clock_that_jumps_back_starts_anew() -> None:
     matcher.push("a", 100.0, 0)
     assert matcher.push("a", 1.0, 1) == []
     assert len(matcher.push("b", 1.01, 2)) == 1
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    phases=st.lists(st.floats(0.0, 1 / 30), min_size=4, max_size=4),
+    delays=st.lists(st.floats(0.0, 0.5), min_size=4, max_size=4),
+    drifts=st.lists(st.floats(-500e-6, 500e-6), min_size=4, max_size=4),
+    doubled=st.sets(st.tuples(st.integers(0, 3), st.integers(0, 89)), max_size=20),
+    lost=st.sets(st.tuples(st.integers(0, 3), st.integers(0, 89)), max_size=18),
+)
+def test_late_doubled_and_lost_frames_cost_no_more_than_themselves(
+    phases: list[float],
+    delays: list[float],
+    drifts: list[float],
+    doubled: set[tuple[int, int]],
+    lost: set[tuple[int, int]],
+) -> None:
+    """A camera whose frames came 300 ms late found the others' frames thrown away."""
+    arrivals = []
+    for camera in range(4):
+        for index in range(90):
+            time_s = phases[camera] + index / 30 * (1.0 + drifts[camera])
+            if (camera, index) in lost:
+                continue
+            arrivals.append((time_s + delays[camera], camera, index, time_s))
+            if (camera, index) in doubled:
+                arrivals.append((time_s + delays[camera], camera, index, time_s))
+    matcher: FramesetMatcher[tuple[int, int]] = FramesetMatcher(_CAMERAS, 0.025)
+    sets = [
+        found
+        for _, camera, index, time_s in sorted(arrivals)
+        for found in matcher.push(_CAMERAS[camera], time_s, (camera, index))
+    ]
+    used = [frame for found in sets for frame in found.frames.values()]
+    assert len(used) == len(set(used))
+    assert all(found.spread_s <= 0.025 for found in sets)
+    assert [found.time_s for found in sets] == sorted(found.time_s for found in sets)
+    assert len(sets) >= 88 - 2 * len(lost)
