@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import inf
 from typing import Generic, TypeVar
 
 Frame = TypeVar("Frame")
@@ -34,16 +35,19 @@ class FramesetMatcher(Generic[Frame]):
     def __init__(self, cameras: Iterable[str], tolerance_s: float) -> None:
         self._queues: dict[str, deque[tuple[float, Frame]]] = {name: deque() for name in cameras}
         self._tolerance_s = tolerance_s
+        self._last_s: dict[str, float] = {}
         self.dropped: dict[str, int] = dict.fromkeys(self._queues, 0)
 
     def push(self, camera: str, time_s: float, frame: Frame) -> list[Frameset[Frame]]:
         """Add a frame; returns the sets that it completes."""
         queue = self._queues[camera]
-        if queue and time_s == queue[-1][0]:
+        last_s = self._last_s.get(camera, -inf)
+        self._last_s[camera] = time_s
+        if time_s == last_s:
             # The same frame once more.
             self.dropped[camera] += 1
             return []
-        if queue and time_s < queue[-1][0]:
+        if time_s < last_s:
             # A clock that was reset, or a replay that began anew: what waited is of the past.
             self.dropped[camera] += len(queue)
             queue.clear()
