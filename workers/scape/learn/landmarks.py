@@ -197,8 +197,9 @@ def _foot_of_neck(t: _Template, roof: Pool, acromion: int) -> int:
     ridge = above[v[above, 2] >= np.where(beside, v[above, 2][None], -np.inf).max(axis=1)]
     shoulder = v[acromion] - v[t.nearest(ridge, v[acromion] * (0.5, 1.0, 1.0))]
     shoulder /= np.linalg.norm(shoulder[[0, 2]])
-    ridge = ridge[(v[ridge, 0] > near) & (v[ridge, 0] < far)]
-    return t.extreme(ridge, -(shoulder * (1.0, 0.0, 1.0) + _UP))
+    at_neck = ridge[(v[ridge, 0] > near) & (v[ridge, 0] < far)]
+    # A template broader or coarser than people has no ridge there: its corner alone decides.
+    return t.extreme(at_neck if len(at_neck) else ridge, -(shoulder * (1.0, 0.0, 1.0) + _UP))
 
 
 def _arm(t: _Template) -> dict[str, int]:
