@@ -184,7 +184,8 @@ def memory_slopes(station: Station, seconds: float) -> list[Row]:
     began_s = time.monotonic()
     while time.monotonic() - began_s < seconds:
         scans.take()
-    scans.settle()
+        # The next one when this one is delivered: what is scanned faster only waits.
+        scans.settle()
     hours = (time.monotonic() - began_s) / 3600.0
     after = _sizes(station)
     slope_mb = max((after[p][0] - before[p][0]) / 1e6 / hours for p in before if p in after)
