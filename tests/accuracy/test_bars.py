@@ -1,0 +1,100 @@
+"""The benchmarks of fit and measurements in a short form: a few bodies of each set.
+
+`make bench-fit` and `make bench-measure` run the same code on more bodies and print each bar as met
+or missed. The limits here lie a little above what is reached, to notice when it gets worse.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_fit import fitted, render_all
+from bench_measure import Table, measured_in, table_of
+from fit_cases import Case, TestBodies, family_cases, hard_cases
+from fit_report import Row
+from measured_scans import Scan
+from surface_errors import surface_errors
+from true_measurements import TrueBody
+from unlike_bodies import UnlikeBodies
+from unlike_sensor import render_unlike
+
+from station.core.bundle import read_bundle
+from station.simulation.sensor import SimulatedBooth
+from workers.cloud.preprocess import preprocess
+from workers.scape.fit.fit import fit_body
+from workers.scape.model.body_model import BodyModel, load_model
+
+BODIES = 3
+HARD = ("no front-upper", "camera 5 mm off", "arms close")
+
+
+@pytest.fixture(scope="module")
+def model() -> BodyModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def family(model: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> list[Row]:
+    return _fitted(model, [*family_cases(TestBodies(), BODIES)], tmp_path_factory.mktemp("family"))
+
+
+def _fitted(model: BodyModel, cases: list[Case], folder: Path) -> list[Row]:
+    render_all(cases, folder)
+    return [fitted(case, model, folder)[0] for case in cases]
+
+
+def _table(model: BodyModel, scans: list[Scan]) -> Table:
+    bodies, _ = measured_in(model, scans)
+    return table_of(scans, bodies["as-scanned"], "as-scanned")
+
+
+def _girth_error_mm(table: Table) -> float:
+    girths = [index for index, name in enumerate(table.names) if "girth" in name]
+    return 1e3 * float(np.nanmean(np.abs(table.error[:, girths])))
+
+
+def _held(table: Table) -> float:
+    measured = np.isfinite(table.value)
+    inside = (table.low <= table.truth) & (table.truth <= table.high)
+    return float(inside[measured].mean())
+
+
+def test_family_bodies_keep_the_bars(model: BodyModel, family: list[Row]) -> None:
+    assert [row.fit.verdict.status for row in family] == ["ok"] * BODIES
+    assert np.mean([row.errors.body_rms for row in family]) < 1.0
+    assert max(row.errors.body_rms for row in family) < 1.3
+    assert max(abs(row.errors.height) for row in family) < 4.0
+    scans = []
+    for row in family:
+        assert row.case.body is not None
+        truth: dict[str, float] = TrueBody(model, row.case.body.vertices).values()
+        scans.append(Scan(row.case.name, {"as-scanned": truth, "standard": truth}, row.fit))
+    table = _table(model, scans)
+    assert _girth_error_mm(table) < 3.5
+    assert _held(table) > 0.90
+
+
+def test_bodies_unlike_the_model_keep_the_bars(model: BodyModel, tmp_path: Path) -> None:
+    """Sculpted bodies, seen by sensors that err otherwise than the reconstruction assumes."""
+    scans, errors = [], []
+    for index, body in enumerate(UnlikeBodies(model, "test").bodies(BODIES)):
+        bundle = render_unlike(body.mesh, tmp_path / body.name, SimulatedBooth(seed=index))
+        fit = fit_body(model, preprocess(read_bundle(bundle)))
+        assert fit.verdict.status == "ok", fit.verdict.reasons
+        errors.append(surface_errors(model, fit.vertices, fit.vertex_seen, body.mesh).body_rms)
+        scans.append(Scan(body.name, body.truth, fit))
+    assert np.mean(errors) < 2.2
+    assert max(errors) < 3.0
+    table = _table(model, scans)
+    assert _girth_error_mm(table) < 10.0
+    assert _held(table) > 0.80
+
+
+def test_nothing_is_lost_unnamed(model: BodyModel, tmp_path: Path) -> None:
+    cases = [case for case in hard_cases(TestBodies()) if case.name in HARD]
+    assert len(cases) == len(HARD)
+    assert {row.case.name: row.lost_unnamed for row in _fitted(model, cases, tmp_path)} == {
+        name: [] for name in HARD
+    }
