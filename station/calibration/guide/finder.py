@@ -1,4 +1,4 @@
-"""Looks for the ball in frames as they come, beside whoever receives them."""
+"""Ball detection in threads beside the process that receives the frames."""
 
 from __future__ import annotations
 
