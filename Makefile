@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-violations bench-drift
+BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
 .PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
@@ -78,7 +78,7 @@ lock: $(VENV)/dev.stamp
 # The benchmarks of fit and measurements render bodies that the model never saw, which takes
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
-bench-capture bench-calibration bench-violations bench-drift: $(VENV)/dev.stamp
+bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

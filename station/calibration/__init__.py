@@ -1,3 +1,3 @@
-"""Calibration of a booth: the cameras' poses and sensors, and the check for moved cameras.
+"""Finding the cameras' places and depth errors, and noticing a camera that moved.
 The calibration file itself is `station.core.rig`.
 """

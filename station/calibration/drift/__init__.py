@@ -1,3 +1,3 @@
-"""Detection of cameras that have moved since the calibration.
+"""Whether a camera has moved since it was calibrated.
 Calibrating anew belongs to `guide` and `solve`.
 """

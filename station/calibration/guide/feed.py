@@ -36,7 +36,7 @@ from station.sensors.recording import check_recording
 
 _POLL_S = 0.05
 _LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
-"""Frames that may wait; each is 0.6 MB."""
+"""Most frames that wait to be taken; each is 0.6 MB."""
 _STOP_S = 5.0
 _GATHER_S = 20.0
 
@@ -124,7 +124,7 @@ class Feed:
 
     @property
     def replays(self) -> bool:
-        """True for recordings, false for live cameras."""
+        """Whether these are recordings, not live cameras."""
         return bool(self._clocks)
 
     @property

@@ -1,4 +1,4 @@
-"""Ball detection in threads beside the process that receives the frames."""
+"""Looks for the ball in frames as they come, beside whoever receives them."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from station.calibration.guide.session import Session
 from station.core.depth_image import Image
 from station.core.errors import CalibrationError
 
-EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
+EMPTY_FIRST = "the empty booth has to be looked at first: station calibrate floor"
 _EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
@@ -149,7 +149,7 @@ def _at_rest(seen: list[BallDetection]) -> bool:
 
 
 def covered(session: Session, reference: str) -> Coverage:
-    """Coverage of the booth by the waved ball so far."""
+    """Coverage by the waved ball so far."""
     coverage = Coverage(session.lensed_cameras(), reference)
     for ball in session.balls:
         coverage.add(ball)
