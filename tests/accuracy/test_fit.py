@@ -41,6 +41,12 @@ def _distance_to(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) ->
     return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
+def _extremities(model: BodyModel) -> np.ndarray:
+    """Mask (P,) of hands and feet."""
+    names = np.array(model.part_names)[model.part_of_vertex]
+    return np.array([n.startswith(("hand", "thumb", "fingers", "foot")) for n in names])
+
+
 def test_the_cloud_lies_on_the_body(bundle: Path) -> None:
     cloud = preprocess(read_bundle(bundle)).cloud
     body = np.load(BODIES / "ben.npz")
@@ -51,9 +57,7 @@ def test_the_cloud_lies_on_the_body(bundle: Path) -> None:
 def test_the_fit_lies_on_the_body(model: BodyModel, fitted: FitResult) -> None:
     truth = np.load(BODIES / "ben.npz")["vertices"]
     away = _distance_to(fitted.vertices, model.faces, truth)
-    names = np.array(model.part_names)[model.part_of_vertex]
-    extremity = np.array([n.startswith(("hand", "thumb", "fingers", "foot")) for n in names])
-    assert np.sqrt(np.mean(away[~extremity] ** 2)) < 0.003
+    assert np.sqrt(np.mean(away[~_extremities(model)] ** 2)) < 0.003
     assert abs(np.ptp(fitted.vertices[:, 2]) - np.ptp(truth[:, 2])) < 0.004
 
 
@@ -116,7 +120,10 @@ def test_a_person_may_face_any_way(model: BodyModel, bundle: Path, turn_deg: flo
 def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     model: BodyModel, bundle: Path, tmp_path: Path
 ) -> None:
-    """Front and back cameras see two sheets; which side of them is out only their distance says."""
+    """Front and back cameras see two sheets; which side of them is out only their distance says.
+
+    Hands and feet are left out: the two sheets of a foot lie too near each other for that.
+    """
     seen = preprocess(read_bundle(bundle)).cloud
     bare = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen.points))
     o3d.io.write_point_cloud(tmp_path / "bare.ply", bare)
@@ -127,7 +134,8 @@ def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     assert np.mean(np.einsum("ni,ni->n", outwards, seen.normals) > 0.0) > 0.95
     fit = fit_body(model, Preprocessed(cloud, (), ()))
     truth = np.load(BODIES / "ben.npz")["vertices"] - cloud.origin_m
-    assert np.sqrt(np.mean(_distance_to(fit.vertices, model.faces, truth) ** 2)) < 0.004
+    away = _distance_to(fit.vertices, model.faces, truth)[~_extremities(model)]
+    assert np.sqrt(np.mean(away**2)) < 0.004
     assert fit.verdict.status == "ok"
 
 
