@@ -9,26 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-import pytest
 from running_station import Station
 
-from station.core.errors import DriverError
-from station.sensors.freenect import find_library
-
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
-
-
-def _has_replay_library() -> bool:
-    try:
-        find_library(replay=True)
-    except DriverError:
-        return False
-    return True
-
-
-needs_replay = pytest.mark.skipif(
-    not _has_replay_library(), reason="libfreenect's replay library is not installed"
-)
 
 
 def _surface_rms_m(result: Path, body: str) -> float:
@@ -40,7 +23,6 @@ def _surface_rms_m(result: Path, body: str) -> float:
     return float(np.sqrt(np.mean(distance**2)))
 
 
-@needs_replay
 def test_a_scan_through_libfreenect_is_delivered_whole(
     make_station: Callable[..., Station],
 ) -> None:
@@ -70,7 +52,6 @@ def test_a_scan_through_libfreenect_is_delivered_whole(
     assert "station start" in refused.stderr
 
 
-@needs_replay
 def test_killed_processes_lose_no_scan(make_station: Callable[..., Station]) -> None:
     """kill -9 of a capture process, of the job mid-fit: the scan is delivered exactly once."""
     station = make_station()
@@ -101,7 +82,6 @@ def test_killed_processes_lose_no_scan(make_station: Callable[..., Station]) -> 
     assert not list((spool / "work").iterdir())
 
 
-@needs_replay
 def test_a_lost_recording_names_the_camera(make_station: Callable[..., Station]) -> None:
     station = make_station(change=lambda text: text.replace("/front-upper", "/nowhere"))
     started = station.command("start", "--timeout", "4")
@@ -115,7 +95,6 @@ def test_a_lost_recording_names_the_camera(make_station: Callable[..., Station])
     assert "front-upper" in refused.stderr
 
 
-@needs_replay
 def test_a_full_disk_refuses_before_the_scan(make_station: Callable[..., Station]) -> None:
     station = make_station("[spool]\nmin_free_mb = 1e9")
     assert station.command("start").returncode == 0
@@ -125,7 +104,6 @@ def test_a_full_disk_refuses_before_the_scan(make_station: Callable[..., Station
     assert not list((station.config.parent / "spool/queue").iterdir())
 
 
-@needs_replay
 def test_sync_killed_in_a_scan_is_reported_as_failed(make_station: Callable[..., Station]) -> None:
     """The operator once waited for ever for a scan that nobody was collecting any more."""
     station = make_station("[scan]\nframesets = 60\nmax_duration_s = 3.0\n[workers]\ncount = 0")
