@@ -11,9 +11,8 @@ import click
 import zmq
 
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.errors import BoothError, DriverError, FormatError
-from station.core.files import held
-from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.errors import DriverError, FormatError
+from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.messages import CameraHealth, DesiredState, FrameHeader, SensorInfo
 from station.messaging.topics import TOPICS
 from station.messaging.transport import publisher, subscriber
@@ -213,7 +212,5 @@ def capture(camera: str, config_path: Path | None) -> None:
     """
     config = load_config(find_config(config_path))
     config.camera(camera)
-    log = set_up_logs(f"capture {camera}")
-    lock = config.runtime.folder / f"capture-{camera}.lock"
-    with held(lock, BoothError(f"camera {camera} is captured already here ({lock})")):
+    with only_process(config.runtime.folder, f"capture {camera}") as log:
         CaptureProcess(config, camera, log).run(stop_event())

@@ -34,9 +34,9 @@ from station.booth.retention import expire_old
 from station.booth.session import CANCELLED, UNSURE, Session, overdue, state_of
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.files import held, private_folder, write_json
+from station.core.files import private_folder, write_json
 from station.core.scans import ScanId, ScanNote, boot_id, scan_id_of
-from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool, failure_reason
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
@@ -264,8 +264,6 @@ def control(config_path: Path | None) -> None:
       station control --config booth.toml
     """
     config = load_config(find_config(config_path))
-    lock = config.runtime.folder / "control.lock"
-    with held(lock, BoothError(f"a control process runs already here ({lock}); end it first")):
-        log = set_up_logs("control")
+    with only_process(config.runtime.folder, "control") as log:
         serve_metrics(config, log)
         ControlProcess(config, log).run(stop_event())

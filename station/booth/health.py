@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from station.booth.supervisor import services
 from station.core.config import BoothConfig
 from station.core.service import read_health
 from station.core.spool import STATES, count_scans
@@ -39,16 +40,10 @@ class BoothHealth:
     """Problems with their remedies, the worst first; empty when there are none."""
 
 
-def process_names(config: BoothConfig) -> list[str]:
-    """The processes that a booth consists of."""
-    names = ["control", "sync", *(f"capture {camera.name}" for camera in config.cameras)]
-    return [*names, "workers"] if config.workers.count else names
-
-
 def booth_health(config: BoothConfig) -> BoothHealth:
     """The booth as it is now; what cannot be read is a problem of its own."""
     folder = config.runtime.folder
-    processes = {name: read_health(folder, name) for name in process_names(config)}
+    processes = {service.name: read_health(folder, service.name) for service in services(config)}
     problems = _silent(processes)
     sync = processes["sync"]
     if not sync or sync["age_s"] > MOST_AGE_S:
@@ -56,7 +51,9 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     for name, camera in sync.get("cameras", {}).items():
         if camera["trouble"]:
             problems.append(f"camera {name}: {camera['trouble']}")
-    problems += [str(problem) for problem in processes.get("workers", {}).get("problems", [])]
+    problems += [
+        str(problem) for content in processes.values() for problem in content.get("problems", [])
+    ]
     spool, oldest_s, stuck, free = _disk(config, problems)
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
 
@@ -69,7 +66,8 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         f"the {name} process has said nothing for {content['age_s']:.0f} s; it is started again "
         "by itself, else: station run"
         if content
-        else f"the {name} process does not run; is it in the log of station run?"
+        else f"the {name} process does not run; its log says why: journalctl -u 'booth-*', or the "
+        "terminal of station run"
         for name, content in processes.items()
         if not content or content["age_s"] > MOST_AGE_S
     ]

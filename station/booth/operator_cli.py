@@ -159,6 +159,8 @@ def _show_status(content: Mapping[str, Any]) -> None:
             f"  {name:<22} {words:<10} {camera['frames']:>8} {camera['lost']:>6} {rate:>5}"
             + (f"  {camera['detail']}" if camera["detail"] else "")
         )
+    for name, count in content["processes"].get("deliver", {}).get("waiting", {}).items():
+        click.echo(f"deliver {name}: " + (f"{count} to hand over" if count else "all handed over"))
     counts = content["spool"]
     free = f"; {content['free_bytes'] / 1e9:.1f} GB free" if content["free_bytes"] else ""
     click.echo(

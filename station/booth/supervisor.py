@@ -40,28 +40,28 @@ class Service:
     """One process of the booth."""
 
     name: str
+    """Its name in `station status`; its health file and its lock are named after it."""
     command: tuple[str, ...]
+    """The command line without the configuration."""
 
 
-def services(config: BoothConfig, path: Path) -> list[Service]:
-    """Every process that a booth consists of."""
-    python = sys.executable
-    option = ("--config", str(path))
-    station = (python, "-m", "station.cli")
+def services(config: BoothConfig) -> list[Service]:
+    """Every process that a booth consists of; `station.booth.health` expects a report of each."""
+    station = (sys.executable, "-m", "station.cli")
     table = [
-        Service("control", (*station, "control", *option)),
-        Service("sync", (*station, "sync", *option)),
+        Service("control", (*station, "control")),
+        Service("sync", (*station, "sync")),
         *(
-            Service(f"capture {camera.name}", (*station, "capture", camera.name, *option))
+            Service(f"capture {camera.name}", (*station, "capture", camera.name))
             for camera in config.cameras
         ),
     ]
     if config.workers.count:
-        table.append(Service("workers", (python, "-m", "workers.cli", "work", *option)))
+        table.append(Service("workers", (sys.executable, "-m", "workers.cli", "work")))
     if config.console.enabled:
-        table.append(Service("console", (*station, "console", *option)))
+        table.append(Service("console", (*station, "console")))
     if config.deliver:
-        table.append(Service("deliver", (*station, "deliver", *option)))
+        table.append(Service("deliver", (*station, "deliver")))
     return table
 
 
@@ -106,8 +106,9 @@ class _Watch:
 class _Child:
     """One supervised process."""
 
-    def __init__(self, service: Service, folder: Path) -> None:
+    def __init__(self, service: Service, config_path: Path, folder: Path) -> None:
         self.service = service
+        self._command = (*service.command, "--config", str(config_path))
         self.process: subprocess.Popen[bytes] | None = None
         self.watch = _Watch(folder, service.name)
         self._failures = 0
@@ -137,7 +138,7 @@ class _Child:
             self._started_s = now_s
             self.watch.begin()
             self.process = subprocess.Popen(
-                self.service.command,
+                self._command,
                 stdin=subprocess.DEVNULL,
                 env={
                     **os.environ,
@@ -152,9 +153,9 @@ class _Child:
             self.process.terminate()
 
 
-def supervise(table: list[Service], folder: Path, stop: threading.Event) -> None:
-    """Keep all services running until told to stop."""
-    children = [_Child(service, folder) for service in table]
+def supervise(table: list[Service], config_path: Path, folder: Path, stop: threading.Event) -> None:
+    """Keep all services running until told to stop; `folder` takes the sockets of their signs."""
+    children = [_Child(service, config_path, folder) for service in table]
     try:
         while not stop.is_set():
             for child in children:
@@ -194,4 +195,4 @@ def run(config_path: Path | None) -> None:
             )
         # Sockets lie where their path is short enough for the kernel.
         sockets = Path(endpoint(folder, "notify").removeprefix("ipc://")).parent
-        supervise(services(config, path.resolve()), sockets, stop_event())
+        supervise(services(config), path.resolve(), sockets, stop_event())

@@ -22,9 +22,8 @@ from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.files import held
 from station.core.scans import ScanId, scan_id_of
-from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.intake import FrameIntake, LiveFrame
 from station.messaging.messages import Reply, Request, ScanEvent
 from station.messaging.transport import publisher, server
@@ -278,6 +277,5 @@ def sync(config_path: Path | None) -> None:
       station sync --config booth.toml
     """
     config = load_config(find_config(config_path))
-    lock = config.runtime.folder / "sync.lock"
-    with held(lock, BoothError(f"a sync process runs already here ({lock}); end it first")):
-        SyncProcess(config, set_up_logs("sync")).run(stop_event())
+    with only_process(config.runtime.folder, "sync") as log:
+        SyncProcess(config, log).run(stop_event())

@@ -24,6 +24,8 @@ from station.console.security.origin import own_names
 
 PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
+_SIGN_PERIOD_S = 0.2
+"""Shorter than the period of health, so that none is left out."""
 
 
 class _Static(StaticFiles):
@@ -42,7 +44,9 @@ def create_app(console: Console) -> FastAPI:
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         console.events.attach(asyncio.get_running_loop())
         console.start()
+        signs = asyncio.create_task(_give_signs(console))
         yield
+        signs.cancel()
         await asyncio.to_thread(console.close)
 
     app = FastAPI(
@@ -61,6 +65,17 @@ def create_app(console: Console) -> FastAPI:
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]  # FastAPI's own way
     app.add_middleware(Gate, names=own_names(console.config.console.names))
     return app
+
+
+async def _give_signs(console: Console) -> None:
+    """Signs of progress: requests are served (this runs among them) and the booth is watched."""
+    console.heart.ready()
+    while True:
+        if not console.watch.hangs():
+            console.heart.beat()
+        if console.heart.due:
+            console.heart.tell(console.watch.health())
+        await asyncio.sleep(_SIGN_PERIOD_S)
 
 
 def _serve_pages(app: FastAPI) -> None:

@@ -17,7 +17,6 @@ from station.console.app import create_app
 from station.console.security.certificate import CERTIFICATE, KEY
 from station.core.config import ConsoleConfig
 from station.core.errors import BoothError, ConfigError
-from station.core.service import notify
 
 _HEAD_S = 10.0
 """A request's head has to arrive within this; nobody holds a connection open by typing slowly."""
@@ -128,7 +127,6 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
     threading.Thread(target=_until, args=(stop, server, console), daemon=True).start()
     scheme = "https" if secure else "http"
     log.info("the console is at %s://%s:%d", scheme, config.host, config.port)
-    notify("READY=1")
     server.run(sockets=[listener])
 
 

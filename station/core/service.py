@@ -20,13 +20,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
-from station.core.files import private_folder, read_small
+from station.core.errors import BoothError
+from station.core.files import held, private_folder, read_small
 
 CACHE_VARIABLE = "BOOTH_CACHE"
 """Names the folder of all caches; the user's cache folder if unset."""
@@ -57,6 +58,19 @@ def set_up_logs(process: str) -> logging.Logger:
         datefmt="%H:%M:%S",
     )
     return logging.getLogger(process)
+
+
+@contextlib.contextmanager
+def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]:
+    """Begin of a process that runs once for each runtime folder; gives its log.
+
+    Raises:
+        BoothError: it runs already.
+    """
+    lock = runtime_folder / f"{file_name(process)}.lock"
+    busy = BoothError(f"a {process} process runs already here ({lock}); end it first")
+    with held(lock, busy):
+        yield set_up_logs(process)
 
 
 def set_up_caches() -> None:

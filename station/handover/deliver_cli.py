@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -13,13 +14,17 @@ from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
-from station.core.service import notify, set_up_logs, stop_event
+from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
 from station.handover.targets import make_target
 
 _POLL_S = 0.2
+_SETTLED_NS = 1_000_000_000
+"""A folder that changes twice within a tick of its file system's clock shows it once."""
 _RESULTS = 100_000
+_HANGS_S = 60.0
+"""A try takes at most ten seconds at a webhook; a folder's may wait for ever for a lost server."""
 
 
 class HandOver:
@@ -31,6 +36,9 @@ class HandOver:
         self._ledger = Ledger(config.spool.folder)
         self._index = ScanIndex(self._spool)
         self._targets = {section.name: make_target(section) for section in config.deliver}
+        self._round_s = dict.fromkeys(self._targets, time.monotonic())
+        """Moment of each target's last progress, monotonic seconds."""
+        self._heart = Heartbeat(config.runtime.folder, "deliver")
 
     def run(self, stop: threading.Event) -> None:
         """Until told to stop."""
@@ -40,15 +48,43 @@ class HandOver:
         ]
         for thread in threads:
             thread.start()
-        notify("READY=1")
+        self._heart.ready()
         changed_ns = -1
+        problem = ""
         while not stop.wait(_POLL_S):
-            notify("WATCHDOG=1")
-            now_ns = (self._spool.folder / "outbox").stat().st_mtime_ns
-            if now_ns == changed_ns and time.time_ns() - now_ns > 1_000_000_000:
-                continue
-            changed_ns = now_ns
-            self.look()
+            try:
+                now_ns = (self._spool.folder / "outbox").stat().st_mtime_ns
+                if now_ns != changed_ns or time.time_ns() - now_ns <= _SETTLED_NS:
+                    self.look()
+                    changed_ns = now_ns
+                problem = ""
+            except OSError as error:
+                problem = f"deliver: the spool cannot be read ({error}); check its disk"
+            self._heart.beat()
+            if self._heart.due:
+                self._heart.tell(self.health(problem))
+
+    def health(self, problem: str = "") -> dict[str, Any]:
+        """The process' word about itself: how many results wait for each target, and why."""
+        waiting = self._ledger.waiting()
+        problems = [problem] if problem else []
+        counts = {}
+        now_s = time.monotonic()
+        for name in self._targets:
+            mine = [entry for entry in waiting if entry.target == name]
+            counts[name] = len(mine)
+            errors = [entry.error for entry in mine if entry.error]
+            if now_s - self._round_s[name] > _HANGS_S:
+                problems.append(
+                    f"deliver {name}: the target does not answer since "
+                    f"{now_s - self._round_s[name]:.0f} s; check the network and the other machine"
+                )
+            elif errors:
+                problems.append(
+                    f"deliver {name}: {len(errors)} not handed over ({errors[0]}); "
+                    "it is tried again"
+                )
+        return {"waiting": counts, "problems": problems}
 
     def look(self) -> None:
         """Note what is new in the outbox."""
@@ -59,6 +95,7 @@ class HandOver:
 
     def _serve(self, name: str, stop: threading.Event) -> None:
         while not stop.wait(_POLL_S):
+            self._round_s[name] = time.monotonic()
             try:
                 self.try_all(name, time.time())
             except (BoothError, OSError) as error:
@@ -68,6 +105,7 @@ class HandOver:
         """Hand over what is due to one target."""
         for entry in self._ledger.waiting():
             if entry.target == name and entry.next_s <= now_s:
+                self._round_s[name] = time.monotonic()
                 self._try(entry, now_s)
 
     def _try(self, entry: Waiting, now_s: float) -> None:
@@ -100,4 +138,5 @@ def deliver(config_path: Path | None) -> None:
     config = load_config(find_config(config_path))
     if not config.deliver:
         raise BoothError("booth.toml has no [[deliver]]: there is nobody to hand results over to")
-    HandOver(config, set_up_logs("deliver")).run(stop_event())
+    with only_process(config.runtime.folder, "deliver") as log:
+        HandOver(config, log).run(stop_event())

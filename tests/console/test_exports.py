@@ -237,10 +237,14 @@ def test_a_folder_gets_a_result_whole_once_the_share_is_there(
     handover.look()
     handover.try_all("share", 1e9)
     assert "is the share mounted" in ledger.waiting()[0].error
+    told = handover.health()
+    assert told["waiting"] == {"share": 1}
+    assert "is the share mounted" in told["problems"][0]
     (tmp_path / "mnt/share").mkdir(parents=True)
     (tmp_path / "mnt/share" / f".{scans[0]['scan_id']}.part").mkdir()
     handover.try_all("share", 2e9)
     assert ledger.waiting() == []
+    assert handover.health() == {"waiting": {"share": 0}, "problems": []}
     names = [path.name for path in (tmp_path / "mnt/share").iterdir()]
     assert names == [scans[0]["scan_id"]]
     there = {path.name for path in (tmp_path / "mnt/share" / names[0]).iterdir()}

@@ -253,7 +253,7 @@ def test_the_documented_processes_are_those_that_run(tmp_path: Path) -> None:
     example = (ROOT / "deploy" / "booth.example.toml").read_text()
     path = tmp_path / "booth.toml"
     path.write_text(f'{example}\n[[deliver]]\nname = "fitting-room"\nfolder = "results"\n')
-    running = {service.name.split()[0] for service in services(load_config(path), path)}
+    running = {service.name.split()[0] for service in services(load_config(path))}
     assert _first_cells(ARCHITECTURE, "Processes") == running
 
 

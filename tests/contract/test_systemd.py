@@ -94,7 +94,7 @@ def test_console_and_deliver_run_as_the_configuration_says(tmp_path: Path) -> No
     units = {
         name.removeprefix("booth-").replace("capture@", "capture ") for name in made | {*fixed}
     }
-    assert units == {service.name for service in services(load_config(config), config)}
+    assert units == {service.name for service in services(load_config(config))}
 
 
 @pytest.mark.parametrize("text", ["", "[[cameras", "cameras = 3", "[[cameras]]\nserial = 'A'"])

@@ -9,10 +9,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from live_console import free_port
 from running_station import Station
 
+from station.booth.health import booth_health
+from station.booth.supervisor import services
+from station.core.config import load_config
 from station.core.errors import BoothError, DriverError
 from station.core.files import held
 from station.core.spool import Spool
@@ -122,11 +127,49 @@ def test_one_station_to_a_runtime_folder(make_station: Callable[..., Station]) -
     assert "a station runs already" in second.stderr
 
 
-@pytest.mark.parametrize("process", ["control", "sync"])
+def test_status_lists_every_process_and_names_a_console_that_hangs(
+    make_station: Callable[..., Station],
+) -> None:
+    """Console and hand-over were missing: an operator without a page saw a sound booth."""
+    extra = (
+        f"[workers]\ncount = 0\n[console]\nport = {free_port()}\n"
+        '[[deliver]]\nname = "share"\nfolder = "not-mounted"\nrescans = true'
+    )
+    station = make_station(extra, _recorded)
+    config = load_config(station.config)
+    result = Spool(config.spool.folder).folder / "outbox/20260101T000000Z-0000"
+    result.mkdir()
+    (result / "result.json").write_text('{"format": "result", "verdict": "ok"}')
+
+    def told() -> dict[str, dict[str, Any]]:
+        return booth_health(config).processes
+
+    def says(words: str) -> Callable[[], bool]:
+        return lambda: words in " ".join(booth_health(config).problems)
+
+    station.wait_until(lambda: all(told().values()), "every process tells its health")
+    assert list(told()) == [service.name for service in services(config)]
+    station.wait_until(says("deliver share: 1 not handed over"), "the lost share is named")
+    shown = station.command("status").stdout
+    assert "deliver share: 1 to hand over" in shown
+    assert "is the share mounted?" in shown
+    [victim] = station.pids("station.cli", "console")
+    os.kill(victim, signal.SIGSTOP)
+    station.wait_until(says("the console process has said nothing"), "the hung console is named")
+    station.wait_until(
+        lambda: told()["console"].get("pid") not in (None, victim),
+        "the hung console is replaced",
+    )
+
+
+@pytest.mark.parametrize("process", ["control", "sync", "deliver"])
 def test_one_process_of_a_kind_to_a_runtime_folder(tmp_path: Path, process: str) -> None:
     """A second control took the first one's socket away, and left the booth deaf when it ended."""
     config = tmp_path / "booth.toml"
-    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    config.write_text(
+        '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+        '[[deliver]]\nname = "share"\nfolder = "results"\n'
+    )
     with held(tmp_path / f"run/{process}.lock", BoothError("busy")):
         second = subprocess.run(
             [*STATION, process, "--config", str(config)],

@@ -26,6 +26,7 @@ from station.console.security.audit import AuditLog
 from station.console.security.throttle import LoginThrottle
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.config import BoothConfig
+from station.core.service import Heartbeat
 from station.core.spool import Spool
 
 COOKIE = "booth_session"
@@ -48,6 +49,7 @@ class Console:
     desk: Desk = field(init=False)
     tasks: Tasks = field(init=False)
     throttle: LoginThrottle = field(init=False)
+    heart: Heartbeat = field(init=False)
     closing: threading.Event = field(init=False, default_factory=threading.Event)
 
     def __post_init__(self) -> None:
@@ -60,6 +62,7 @@ class Console:
         self.desk = Desk(self.config, self.events)
         self.tasks = Tasks(self.config_path, folder, self.events)
         self.throttle = LoginThrottle()
+        self.heart = Heartbeat(self.config.runtime.folder, "console")
 
     def start(self) -> None:
         self.watch.start()

@@ -17,7 +17,6 @@ from station.console.live.control import NotRunningError, RefusedError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
-from station.core.service import notify
 from station.core.spool import Spool
 from station.messaging.messages import CameraHealth, Request, ScanEvent
 from station.messaging.transport import subscriber
@@ -27,6 +26,8 @@ _SPOOL_S = 0.1
 _STATUS_S = 1.0
 _SILENT_S = 1.3
 """Health comes twice a second; two that are missing say that the capture process is gone."""
+_HANGS_S = 2.0
+"""A round takes milliseconds; the supervisor waits for longer before it acts."""
 _RECENT = 200
 
 
@@ -56,6 +57,8 @@ class Watch:
         self._cameras = {camera.name: CameraState(camera.name) for camera in config.cameras}
         self._status: dict[str, Any] = {}
         self._fault = ""
+        self._problem = ""
+        self._round_s = time.monotonic()
         self._rate_hz: float | None = None
         self._framesets: tuple[int, float] | None = None
         self._seen: dict[str, str] | None = None
@@ -74,6 +77,14 @@ class Watch:
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
+
+    def hangs(self) -> bool:
+        """Whether the booth is not watched any more, although its thread should run."""
+        return time.monotonic() - self._round_s > _HANGS_S
+
+    def health(self) -> dict[str, Any]:
+        """The console's word about itself for `station status`."""
+        return {"problems": [f"console: {self._problem}"] if self._problem else []}
 
     def booth(self) -> dict[str, Any]:
         """Everything of the booth's state that is known now."""
@@ -96,6 +107,7 @@ class Watch:
         incoming = subscriber(context, self._config.runtime.folder, sources, ["scan", "health"])
         looked_s = 0.0
         while not self._stop.is_set():
+            self._round_s = time.monotonic()
             try:
                 if incoming.poll(_POLL_MS):
                     self._hear(*incoming.recv_multipart())
@@ -104,9 +116,10 @@ class Watch:
                     looked_s = now_s
                     self._watch_spool()
                     self._watch_silence(now_s)
-                    notify("WATCHDOG=1")
+                    self._problem = ""
             except (BoothError, OSError, zmq.ZMQError) as error:
                 self._log.warning("watching the booth: %s", error)
+                self._problem = f"the booth cannot be watched ({error}); it is tried again"
                 self._stop.wait(1.0)
         context.destroy(linger=0)
 
