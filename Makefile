@@ -13,14 +13,14 @@ help:
 	@echo "make test     all tests"
 	@echo "make test-console   the console in a browser (Debian's chromium); -long: 5,000 requests"
 	@echo "make check    lint, formatting and types"
-	@echo "make train    learn the body model anew (minutes)"
-	@echo "make evaluate-model   tables of the body model on bodies that it has not seen"
-	@echo "make intervals  calibrate the measurements' intervals anew, after any change to model or fit"
-	@echo "make test-faults   kill, stop, starve and fuzz the station: the short form of the table (a minute)"
+	@echo "make train    learn the body model (minutes)"
+	@echo "make evaluate-model   tables of the body model on held-out bodies"
+	@echo "make intervals  learn the measurements' intervals, after any change to model or fit"
+	@echo "make test-faults   kill, stop, starve and fuzz the station: the short form (a minute)"
 	@echo "make soak     the long form, then scans for hours; ARGS=\"--minutes 600\""
 	@echo "make package  the Debian packages, wheel and source distribution of this commit, in dist/"
-	@echo "make test-install   install them on a fresh Debian under systemd and put them to the test (root)"
-	@echo "make lock     pin the packages' dependencies anew"
+	@echo "make test-install   install them on a fresh Debian under systemd and test them (root)"
+	@echo "make lock     update the packages' pinned dependencies"
 	@echo "make $(BENCHES)   tables of speed and accuracy"
 
 demo: $(VENV)/runtime.stamp
@@ -75,7 +75,7 @@ lock: $(VENV)/dev.stamp
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
 	$(BIN)/python deploy/package/update_lock.py
 
-# The benchmarks of fit and measurements render bodies that the model never saw, which takes
+# The benchmarks of fit and measurements render held-out bodies, which needs
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
 bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
@@ -89,7 +89,7 @@ $(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
 
 $(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[simulation]'
-	@echo "compiling what the first scan would otherwise wait for"
+	@echo "compiling in advance, so that the first scan does not have to wait"
 	$(BIN)/python -c "from workers.reconstruct.job import warm_up; warm_up()"
 	touch $@
 

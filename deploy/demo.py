@@ -27,7 +27,7 @@ WAVING_S = 24
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("demo"), help="where it all goes")
+    parser.add_argument("--folder", type=Path, default=Path("demo"), help="output folder")
     parser.add_argument("--body", type=Path, default=BODY, help="the virtual person")
     arguments = parser.parse_args()
     booth = arguments.folder.resolve() / arguments.body.stem
@@ -39,7 +39,7 @@ def main() -> int:
         print(f"note: {error}; reading the same recordings with the recorded driver")
         driver = "recorded"
     if not config.exists() or f'"{driver}"' not in config.read_text():
-        print("rendering what four Kinects see of a calibration and a person ...", flush=True)
+        print("rendering what four Kinects see during a calibration and a scan ...", flush=True)
         options = ("--body", arguments.body, "--out", booth, "--driver", driver)
         calibration = ("--calibration", str(WAVING_S))
         record = [*STATION, "record-virtual", *options, *calibration]
@@ -49,7 +49,7 @@ def main() -> int:
         calibrate = [*STATION, "calibrate", "--recordings", str(booth / PROCEDURE)]
         if subprocess.run(calibrate, env=environment, check=False).returncode:
             return 1
-        # What was seen is kept beside the calibration; the recordings take a gigabyte.
+        # The detections are kept beside the calibration; the recordings take a gigabyte.
         shutil.rmtree(booth / PROCEDURE)
     compare(Rig.load(booth / "calibration.json"), Rig.load(booth / TRUTH))
     log = (booth / "station.log").open("w")
@@ -87,7 +87,7 @@ def compare(found: Rig, truth: Rig) -> None:
 
 
 def _wait_for_control(environment: dict[str, str]) -> None:
-    """The station is up when it answers."""
+    """Wait until the station responds."""
     for _ in range(10):
         answer = subprocess.run(
             [*STATION, "status"], env=environment, capture_output=True, check=False

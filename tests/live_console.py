@@ -84,7 +84,7 @@ class LiveConsole:
                 answer = client.post("/scans", json={"label": label}, headers=headers)
                 assert answer.status_code == 202, answer.text
                 found = self.wait_for(answer.json()["scan_id"])
-                if "gives no frames" not in "".join(found["reasons"]):
+                if "sends no frames" not in "".join(found["reasons"]):
                     break
                 # A camera may have begun to stream and not be matched with the others yet.
                 time.sleep(0.2)

@@ -1,2 +1,2 @@
-"""Setting up a booth and keeping it: what is done by an administrator, seldom, with the booth at
-rest. No process of the booth imports this."""
+"""Setting up a booth and keeping it: tasks of an administrator. No process of the booth imports
+this."""

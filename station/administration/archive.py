@@ -1,4 +1,4 @@
-"""Backups: their parts, and a folder with a manifest of checksums that is written and read."""
+"""Backups: their parts, and folders with a manifest of checksums, written and read."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Part:
 
 
 def parts(config_path: Path, config: BoothConfig) -> list[Part]:
-    """Everything that there is of a booth and makes it this booth."""
+    """All parts of a booth that a backup may contain."""
     names = ["booth.toml", "calibration.json", "calibrations", "console"]
     names += [f"spool/{path.name}" for path in _entries(config.spool.folder)]
     if config_path == CONFIG:
@@ -77,7 +77,7 @@ def part(name: str, config_path: Path, config: BoothConfig) -> Part:
     }
     group, _, rest = name.partition("/")
     if group not in folders or not rest or "/" in rest or rest in (".", ".."):
-        raise FormatError(f"no backup has a part {name!r}")
+        raise FormatError(f"a backup has no part called {name!r}")
     return Part(name, folders[group] / rest, personal=group == "spool")
 
 
@@ -90,7 +90,7 @@ def _entries(folder: Path) -> list[Path]:
 def save(
     folder: Path, config_path: Path, config: BoothConfig, *, with_scans: bool
 ) -> tuple[Path, int]:
-    """Write a new backup into `folder`; it appears under its name when it is whole.
+    """Write a new backup into `folder`; it appears under its name when it is complete.
 
     Returns:
         the backup, and how many files it holds.
@@ -120,23 +120,26 @@ def check(backup: Path) -> list[str]:
         the names of its parts.
 
     Raises:
-        FormatError: it is no backup, of an unknown version, or a file is missing, extra or changed.
+        FormatError: it is not a backup, of an unknown version, or a file is missing, extra or
+        changed.
     """
     manifest = read_json(backup / MANIFEST, format=FORMAT, versions=(VERSION,))
     expected: dict[str, str] = manifest["sha256"]
     found = {str(path.relative_to(backup)) for path in _files(backup)} - {MANIFEST}
     for name in sorted(expected.keys() - found):
-        raise FormatError(f"{backup} lacks {name}; use another backup")
+        raise FormatError(f"{backup} does not contain {name}; use another backup")
     for name in sorted(found - expected.keys()):
-        raise FormatError(f"{backup} holds {name}, which its manifest does not name")
+        raise FormatError(
+            f"{backup} contains {name}, which its manifest does not list; use another backup"
+        )
     for name, digest in expected.items():
         if sha256(backup / name) != digest:
             raise FormatError(f"{backup / name} has changed since it was saved; use another backup")
     return [str(name) for name in manifest["parts"]]
 
 
-def bring_back(backup: Path, one: Part) -> None:
-    """Put a part where it belongs, whole or not at all; what was there is kept beside it."""
+def restore_part(backup: Path, one: Part) -> None:
+    """Restore a part completely or not at all; what it replaces is kept beside it."""
     fresh = one.place.with_name(f".{one.place.name}.restored")
     _remove(fresh)
     _copy(backup / CONTENT / one.name, fresh)
@@ -161,7 +164,7 @@ def _files(folder: Path) -> Iterator[Path]:
 def _copy(source: Path, target: Path) -> None:
     for path in (source, *source.rglob("*")):
         if path.is_symlink():
-            raise BoothError(f"{path} is a symbolic link; a backup holds plain files")
+            raise BoothError(f"{path} is a symbolic link; a backup contains plain files only")
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.is_dir():
         ignore = shutil.ignore_patterns(*_JOURNALS)
@@ -171,7 +174,8 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _copy_file(source: Path | str, target: Path | str) -> None:
-    """Copy a file; of a database whatever its last transaction left, also while it is written."""
+    """Copy a file; a database is copied as of its last transaction, even while it is being
+    written."""
     if not str(source).endswith(_DATABASE):
         shutil.copy2(source, target)
         return

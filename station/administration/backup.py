@@ -1,4 +1,5 @@
-"""`station backup`: everything that makes this booth, saved into a folder."""
+"""`station backup`: configuration, calibrations and other data of this booth, saved into a
+folder."""
 
 from __future__ import annotations
 
@@ -17,10 +18,10 @@ from station.core.errors import BoothError
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
 @click.option("--with-scans", is_flag=True, help="also scans and results (personal data)")
 def backup(folder: Path, config_path: Path | None, with_scans: bool) -> None:
-    """Save configuration, calibrations and what the booth has learned into FOLDER.
+    """Save configuration, calibrations and other data of the booth into FOLDER.
 
     Each backup is a folder of its own with the time in its name, readable by you alone. It is read
-    again and compared before the command ends. The booth may run meanwhile, but not with
+    back and verified before the command ends. The booth may keep running, except with
     --with-scans.
 
     \b
@@ -30,9 +31,11 @@ def backup(folder: Path, config_path: Path | None, with_scans: bool) -> None:
     """
     path = find_config(config_path).resolve()
     if with_scans and units.running():
-        raise BoothError("scans move while the booth runs; first: systemctl stop booth.target")
+        raise BoothError(
+            "scans change while the booth is running; first run: systemctl stop booth.target"
+        )
     saved, count = save(folder, path, load_config(path), with_scans=with_scans)
     check(saved)
-    click.echo(f"{saved}: {count} files, read again and whole")
+    click.echo(f"{saved}: {count} files, read back and verified")
     if not with_scans:
         click.echo("scans and results are not in it (--with-scans)")

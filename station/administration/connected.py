@@ -24,7 +24,7 @@ class ConnectedCamera:
 
     model: str
     controller: str
-    """The PCI address of the USB controller that it hangs on."""
+    """The PCI address of the USB controller that it is connected to."""
 
 
 class _Attributes(ctypes.Structure):
@@ -38,7 +38,8 @@ _Attributes._fields_ = [
 
 
 def connected_cameras(devices: Path = _DEVICES) -> list[ConnectedCamera]:
-    """Every Kinect camera that the kernel has found, also those that may not be opened."""
+    """Every Kinect camera that the kernel has found, including those that this user may not
+    open."""
     found = []
     for folder in sorted(devices.glob("*")):
         if _text(folder / "idVendor") == _MICROSOFT:
@@ -49,7 +50,8 @@ def connected_cameras(devices: Path = _DEVICES) -> list[ConnectedCamera]:
 
 
 def crowded_controllers(cameras: Sequence[ConnectedCamera]) -> dict[str, int]:
-    """Controllers that more than one camera hangs on: a Kinect v1 takes most of USB 2's bandwidth.
+    """Controllers that more than one camera is connected to: a Kinect v1 takes most of USB 2's
+    bandwidth.
 
     Returns:
         PCI address -> number of cameras.

@@ -1,4 +1,4 @@
-"""`station migrate`: bring the state folder to this version's layout, or refuse what is unknown."""
+"""`station migrate`: bring the state folder to this version's layout, or refuse an unknown one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from station.core.files import private_folder, read_json, write_json
 STATE = "state.json"
 FORMAT = "booth-state"
 VERSION = 1
-"""Raise it with the layout; deploy/package/body-booth/preinst names the versions that it reads."""
+"""Increased with every change of the layout; deploy/package/body-booth/preinst names the versions
+that it reads."""
 
 Migrations = Mapping[int, Callable[[Path], None]]
 MIGRATIONS: Migrations = {}
-"""Version -> what makes the next version of it; may be repeated after a crash."""
+"""Version -> function that migrates to the next version; may be repeated after a crash."""
 
 
 def migrate(folder: Path, migrations: Migrations = MIGRATIONS, version: int = VERSION) -> int:

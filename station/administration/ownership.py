@@ -1,4 +1,4 @@
-"""Ownership of files: what root's commands write is left to the booth's user."""
+"""Ownership of files: files written by root's commands are given to the booth's user."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def is_installed_root() -> bool:
 
 
 def give_to_booth(paths: Iterable[Path]) -> None:
-    """Make files and folders, with all that is in them, the booth's own; only root may."""
+    """Give files and folders, with their contents, to the booth's user; needs root."""
     if not is_installed_root():
         return
     for path in paths:

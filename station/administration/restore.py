@@ -1,4 +1,4 @@
-"""`station restore`: a backup brought back."""
+"""`station restore`: restores a backup."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from station.administration import units
-from station.administration.archive import CONTENT, Part, bring_back, check, part
+from station.administration.archive import CONTENT, Part, check, part, restore_part
 from station.administration.booth_file import CONFIG, STATE_FOLDER
 from station.administration.migrate import migrate
 from station.administration.ownership import USER, give_to_booth, is_installed_root
@@ -20,9 +20,9 @@ from station.core.errors import BoothError, ConfigError
 @click.argument("backup", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
 def restore(backup: Path, config_path: Path | None) -> None:
-    """Bring back what `station backup` saved in BACKUP; the booth must be stopped.
+    """Restore what `station backup` saved in BACKUP; the booth must be stopped.
 
-    The whole backup is checked before anything is touched. What it replaces stays beside it under
+    The whole backup is checked before anything is changed. What it replaces stays beside it under
     a name that ends in .before-restore.
 
     \b
@@ -33,25 +33,25 @@ def restore(backup: Path, config_path: Path | None) -> None:
     """
     path = find_config(config_path).resolve()
     if units.running():
-        raise BoothError("the booth runs; first: systemctl stop booth.target")
+        raise BoothError("the booth is running; first run: systemctl stop booth.target")
     if path == CONFIG and not is_installed_root():
-        raise ConfigError(f"{path} belongs to root: sudo station restore, or name another --config")
+        raise ConfigError(f"{path} belongs to root: run it with sudo, or give another --config")
     backup = backup.resolve()
     names = check(backup)
     saved = load_config(backup / CONTENT / "booth.toml")
     for name in names:
         part(name, path, saved)
     path.parent.mkdir(parents=True, exist_ok=True)
-    bring_back(backup, Part("booth.toml", path))
+    restore_part(backup, Part("booth.toml", path))
     config = load_config(path)
     others = [part(name, path, config) for name in names if name != "booth.toml"]
     for one in others:
-        bring_back(backup, one)
+        restore_part(backup, one)
     if path == CONFIG:
         give_to_booth([STATE_FOLDER, config.spool.folder])
         _protect(path.parent)
         migrate(STATE_FOLDER)
-    click.echo(f"{backup.name} is back: {', '.join(names)}")
+    click.echo(f"{backup.name} is restored: {', '.join(names)}")
     click.echo("next: station setup" if path == CONFIG else "next: station run")
 
 

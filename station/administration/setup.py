@@ -1,4 +1,4 @@
-"""`station setup`: from connected cameras to a booth that runs."""
+"""`station setup`: from connected cameras to a running booth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ANSWER_S = 30.0
 """Control answers a second after its start; cold disks and four more processes take longer."""
 _COMMAND = "/usr/bin/station"
 _PASSWORD_GROUPS = 4
-"""Groups of 16 random bits: 64 bits are too many to try against argon2id."""
+"""Groups of 16 random bits: 64 bits cannot be guessed against argon2id."""
 _BODY = Path(__file__).parents[1] / "simulation/bodies/ann.npz"
 _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
 """Folders that the services do not see."""
@@ -54,7 +54,7 @@ _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
 )
 @click.option("--virtual", is_flag=True, help="render a virtual booth with a person and replay it")
 @click.option(
-    "--replace", is_flag=True, help="write booth.toml anew; the old one is kept beside it"
+    "--replace", is_flag=True, help="write a new booth.toml; the old one is kept beside it"
 )
 @click.option("--start/--no-start", default=True, help="enable and start the booth's services")
 def setup(
@@ -65,7 +65,7 @@ def setup(
     replace: bool,
     start: bool,
 ) -> None:
-    """Find the cameras, write booth.toml, start the booth, and say what is left to do.
+    """Find the cameras, write booth.toml, start the booth, and list what remains to be done.
 
     A second call changes nothing that is already there: a booth.toml that exists is kept.
 
@@ -78,7 +78,7 @@ def setup(
     path = find_config(config_path).resolve()
     installed = path == CONFIG
     if installed and not is_installed_root():
-        raise ConfigError(f"{path} belongs to root: sudo station setup, or name another --config")
+        raise ConfigError(f"{path} belongs to root: run it with sudo, or give another --config")
     changed = replace or not path.exists()
     if changed:
         if virtual:
@@ -87,7 +87,7 @@ def setup(
         _write(path, cameras, installed=installed)
     elif virtual or recordings or pairs:
         raise ConfigError(
-            f"{path} exists; --replace writes it anew and keeps the old one beside it"
+            f"{path} exists; --replace writes a new one and keeps the old one beside it"
         )
     config = load_config(path)
     click.echo(f"{path}: {len(config.cameras)} cameras" + ("" if changed else ", kept"))
@@ -100,7 +100,7 @@ def setup(
     if start and installed and units.installed():
         units.start(afresh=changed)
         _wait_for_control()
-        click.echo("the booth runs, and starts with the machine")
+        click.echo("the booth is running and will start with the machine")
         subprocess.run([_COMMAND, "start"], check=False)
     _say_what_is_left(config, installed=installed, started=start and installed)
 
@@ -112,7 +112,7 @@ def _find(
         folder = recordings.resolve()
         if installed and str(folder).startswith(_UNREADABLE):
             raise ConfigError(
-                f"{folder} is out of the services' sight; copy it to {STATE_FOLDER}/recordings"
+                f"the services cannot read {folder}; copy it to {STATE_FOLDER}/recordings"
             )
         return recorded_cameras(folder)
     serials = serial_numbers()
@@ -121,7 +121,7 @@ def _find(
         if seen:
             raise DriverError(
                 f"{len(seen)} Kinects are connected but cannot be opened; unplug them and plug "
-                "them in again, so that the new permissions hold"
+                "them in again, so that the new permissions take effect"
             )
         raise DriverError(
             "no Kinect is connected: check USB and the sensors' own power supplies, or try the "
@@ -162,7 +162,7 @@ def _render(folder: Path) -> Path:
 
 
 def _take_calibration(recordings: Path, config: BoothConfig) -> None:
-    """Recordings of a virtual booth bring its calibration along."""
+    """Copy the calibration that comes with recordings of a virtual booth."""
     source = recordings / "calibration.json"
     if source.exists() and not config.calibration.exists():
         write_bytes(config.calibration, source.read_bytes())
@@ -171,20 +171,20 @@ def _take_calibration(recordings: Path, config: BoothConfig) -> None:
 
 
 def _give_password(config: BoothConfig) -> None:
-    """A password for the console where there is none; it is shown once."""
+    """Set a password for the console if there is none, and show it once."""
     with closing(Vault(config.console.folder)) as vault:
         missing = not vault.has_password
         if missing:
             password = "-".join(secrets.token_hex(2) for _ in range(_PASSWORD_GROUPS))
             vault.set_password(password)
     if missing:
-        click.echo(f"the console's password, shown this once: {password}")
-        click.echo("  another one: station console --set-password")
+        click.echo(f"the console's password, shown only once: {password}")
+        click.echo("  to change it: station console --set-password")
     give_to_booth([config.console.folder])
 
 
 def _wait_for_control() -> None:
-    """Until control answers; the command runs as the booth's user, whose sockets they are."""
+    """Wait until control answers; the command runs as the booth's user, who owns the sockets."""
     deadline_s = time.monotonic() + _ANSWER_S
     while True:
         done = subprocess.run([_COMMAND, "status"], capture_output=True, text=True, check=False)
@@ -192,9 +192,7 @@ def _wait_for_control() -> None:
             return
         if time.monotonic() > deadline_s:
             cause = done.stderr.strip().removeprefix("error: ")
-            raise BoothError(
-                f"the booth does not answer ({cause}); journalctl -u 'booth-*' tells why"
-            )
+            raise BoothError(f"the booth does not respond ({cause}); see journalctl -u 'booth-*'")
         time.sleep(0.2)
 
 
@@ -213,16 +211,17 @@ def _say_what_is_left(config: BoothConfig, *, installed: bool, started: bool) ->
             left.append(f"connect the sensors {', '.join(missing)}")
         for controller, count in crowded_controllers(connected_cameras()).items():
             left.append(
-                f"{count} sensors hang on one USB controller ({controller}): give each its own"
+                f"{count} sensors share one USB controller ({controller}): connect each to one of "
+                "its own"
             )
         left.append(
-            "cover one lens after the other and see in `station status` that the right camera goes "
-            "silent; else station setup --replace --camera NAME=SERIAL"
+            "cover one lens after another and check in `station status` that the right camera "
+            "goes silent; if not, run station setup --replace --camera NAME=SERIAL"
         )
     if not config.calibration.exists():
         left.append("station calibrate")
     if not started:
         left.append("systemctl enable --now booth.target" if installed else "station run")
-    click.echo("left to do:" if left else 'ready: station scan --label "Order 1234"')
+    click.echo("still to do:" if left else 'ready: station scan --label "Order 1234"')
     for number, words in enumerate(left, 1):
         click.echo(f"  {number}. {words}")

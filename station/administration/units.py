@@ -1,4 +1,4 @@
-"""The booth's systemd units: whether there are any, and starting them."""
+"""The booth's systemd units: whether they are installed, and starting them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PLACE = Path("/usr/lib/systemd/system") / TARGET
 
 
 def installed() -> bool:
-    """Whether systemd runs this machine and the package has given it the booth's units."""
+    """Whether this machine runs systemd and the package has installed the booth's units."""
     return Path("/run/systemd/system").is_dir() and _PLACE.exists()
 
 
@@ -25,7 +25,7 @@ def start(*, afresh: bool) -> None:
     """Enable the target for every boot and start it.
 
     Args:
-        afresh: whether booth.toml has changed, so that what runs must be started anew.
+        afresh: whether booth.toml has changed, so that running units must be restarted.
 
     Raises:
         BoothError: systemd's own words.

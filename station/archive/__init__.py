@@ -1,3 +1,3 @@
-"""Scans as their folders tell of them: index, tables, comparisons, exports.
-Commands, the console and the hand-over use it; how it reaches them belongs to those.
+"""Information about scans, read from their folders: index, tables, comparisons, exports. It is used
+by the commands, the console and the hand-over.
 """

@@ -1,4 +1,4 @@
-"""All files of a result in one archive, with what is made from them for people."""
+"""All files of a result in one archive, with printable and spreadsheet versions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEDIA_TYPES = {
     ".obj": "model/obj",
 }
 _STORED = (".png", ".glb", ".ply")
-"""Compressing these takes longer than it saves."""
+"""File types that are not worth compressing."""
 
 
 def result_zip(scan: ScanRecord, folder: Path, unit: Unit, language: Language) -> bytes:

@@ -1,4 +1,4 @@
-"""Two scans compared: each measurement's difference, and how far the surfaces lie apart."""
+"""Two scans compared: each measurement's difference, and the distances between the surfaces."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SurfaceDifference:
 def compare_rows(
     first: Path, second: Path, pose: Pose, unit: Unit, language: Language
 ) -> list[dict[str, Any]]:
-    """Each measurement that both results have, second less first.
+    """Each measurement that both results have, second minus first.
 
     A difference counts as real where it exceeds what both 95 % intervals explain together
     (the root of the sum of their half-widths' squares).
@@ -79,9 +79,9 @@ def compare_rows(
 
 @lru_cache(maxsize=8)
 def compare_surfaces(first: Path, second: Path) -> SurfaceDifference:
-    """The surfaces of two results, the second laid over the first as a rigid whole.
+    """The surfaces of two results, the second rigidly aligned to the first.
 
-    Both as they stood: limbs that were held otherwise show as differences.
+    Both as scanned: limbs held in a different position show up as differences.
 
     Raises:
         FormatError: a mesh is missing or damaged.

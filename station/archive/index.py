@@ -1,8 +1,8 @@
 """All scans of a spool by label and time, found without reading every folder again.
 
-A database beside the folders (`index.sqlite`) remembers what they said. The folders are the truth:
-each look compares names, reads what is new and forgets what is gone, and a database that is
-missing or damaged is made anew from them.
+A database beside the folders (`index.sqlite`) caches their contents. The folders are authoritative:
+each query compares names, reads new folders and removes missing ones, and a missing or damaged
+database is rebuilt from them.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ class ScanIndex:
         """Scans, the newest first.
 
         Args:
-            text: what the label or the scan id contains, whatever its case.
+            text: text that the label or the scan id contains, ignoring case.
             label: the whole label, exactly.
             since, until: bounds of `created`, ISO 8601, the second one excluded.
             states: any of them; all if empty.
-            before: (created, scan_id) of the last scan of the page before.
-            limit: at most so many.
+            before: (created, scan_id) of the last scan of the previous page.
+            limit: maximum number of scans.
         """
         where, values = ["1"], list[str | int]()
         if text:
@@ -102,7 +102,7 @@ class ScanIndex:
         try:
             database = self._connect()
         except sqlite3.DatabaseError:
-            # Torn, or another program's: what it knew is in the folders.
+            # Damaged, or not this program's: its contents are rebuilt from the folders.
             for suffix in ("", "-wal", "-shm"):
                 Path(f"{self._path}{suffix}").unlink(missing_ok=True)
             database = self._connect()
@@ -130,7 +130,7 @@ class ScanIndex:
         return database
 
     def _refresh(self, database: sqlite3.Connection) -> None:
-        """Bring the database up to what the folders hold now."""
+        """Update the database to the current contents of the folders."""
         changed = {place: self._changed_ns(place) for place in PLACES}
         known = dict(database.execute("SELECT place, changed_ns FROM folders"))
         if known == changed:

@@ -1,4 +1,4 @@
-"""`station list` and `station find`: scans by time and by whose they are."""
+"""`station list` and `station find`: scans by time and by label."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ _WORDS = {
 @click.command("list")
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
 @click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
-@click.option("--limit", default=20, show_default=True, help="at most so many, the newest first")
-@click.option("--json", "as_json", is_flag=True, help="for programs")
+@click.option(
+    "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
+)
+@click.option("--json", "as_json", is_flag=True, help="print JSON")
 def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
-    """List the scans of this booth, the newest first, with what became of them.
+    """List the scans of this booth, newest first, with their outcome.
 
     \b
     Examples:
@@ -42,10 +44,12 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
 @click.command()
 @click.argument("text")
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
-@click.option("--limit", default=20, show_default=True, help="at most so many, the newest first")
-@click.option("--json", "as_json", is_flag=True, help="for programs")
+@click.option(
+    "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
+)
+@click.option("--json", "as_json", is_flag=True, help="print JSON")
 def find(text: str, config_path: Path | None, limit: int, as_json: bool) -> None:
-    """Find scans whose label or id contains TEXT, whatever its case.
+    """Find scans whose label or id contains TEXT, ignoring case.
 
     \b
     Examples:
@@ -62,14 +66,14 @@ def _show(config_path: Path | None, text: str, since: str, limit: int, as_json: 
         click.echo(json.dumps([{**asdict(scan), "verdict": scan.verdict} for scan in found]))
         return
     if not found:
-        click.echo(f"no scan with {text!r}" if text else "no scans yet")
+        click.echo(f"no scan matches {text!r}" if text else "no scans yet")
     for scan in found:
         click.echo(_line(scan))
 
 
 def _line(scan: ScanRecord) -> str:
     taken = scan.created.replace("T", " ").removesuffix("Z")
-    # A label is somebody's text: control characters would reach the terminal.
+    # A label is arbitrary text: control characters must not reach the terminal.
     label = "".join(c if c.isprintable() else "?" for c in scan.label) or "-"
     reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons else ""
     return f"{scan.scan_id:<24} {taken}  {_WORDS[scan.state]:<14} {label}{reasons}"

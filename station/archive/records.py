@@ -1,4 +1,4 @@
-"""One scan as its folder tells: whose it is, when it was taken, what became of it."""
+"""One scan as recorded in its folder: label, time, outcome."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ PLACES: dict[str, ScanState] = {
     "failed": "failed",
     "outbox": "delivered",
 }
-"""Folder of the spool -> state; a result in the outbox may also say that the scan is to be done
-again. In the order in which a scan passes them: of a scan in two, the later counts."""
+"""Folder of the spool -> state; a result in the outbox may also ask for another scan. In the order
+in which a scan passes them: if a scan is in two, the later one counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,7 @@ def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
         return None
     if place == "outbox":
         result = _read(folder / "result.json")
-        # Results of earlier versions do not say whose they are; their bundle does, while it is
-        # kept.
+        # Results of earlier versions have no label; their bundle has, while it is kept.
         bundle = {} if "label" in result else _read(spool.path("done", scan_id) / "bundle.json")
         origin = {**bundle, **result}
         state: ScanState = "rescan" if result.get("status") == "rescan" else "delivered"

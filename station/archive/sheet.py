@@ -1,4 +1,4 @@
-"""One A4 page for the file or the fitting: every line drawn on the body, the table, the verdict."""
+"""One A4 page to print: every line drawn on the body, the table, the verdict."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _WORDS: dict[Language, dict[str, str]] = {
     "en": {"front": "front", "left": "left side", "back": "back", "as-scanned": "as scanned",
            "standard": "standard pose", "value": "value", "l": "left", "r": "right",
            "note": "± half the 95 % interval. Lines are drawn where they were measured.",
-           "unlabelled": "no order"},
+           "unlabelled": "no label"},
     "zh": {"front": "正面", "left": "左侧", "back": "背面", "as-scanned": "扫描姿势",
            "standard": "标准姿势", "value": "数值", "l": "左", "r": "右",
            "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。", "unlabelled": "无订单"},
@@ -50,7 +50,7 @@ _OTHER_FILES = (
     Path("/usr/share/fonts-droid-fallback/truetype/DroidSansFallback.ttf"),
 )
 """Debian's fonts-droid-fallback: one TrueType font of nearly every script, so that it is embedded.
-STSong-Light is not embedded: screens have a stand-in for it, printers may not."""
+STSong-Light is not embedded: viewers substitute it, printers may not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ def _numbers(
     width: float,
     on_left: bool,
 ) -> None:
-    """Numbers in a column beside the body, none upon another, each with a thin leader."""
+    """Numbers in a column beside the body, without overlap, each with a thin leader line."""
     edge = x - 14 if on_left else x + width + 6
     below = _FIGURE_TOP + 8
     canvas.setLineWidth(0.25)

@@ -50,7 +50,7 @@ def seamly_name(name: str) -> str:
 
 
 def _legal(text: str) -> str:
-    """Without the characters that XML 1.0 has no way to hold."""
+    """Text without the characters that XML 1.0 does not allow."""
     return "".join(c for c in text if c in "\t\n\r" or (ord(c) >= 32 and ord(c) not in _NOT_XML))
 
 

@@ -1,4 +1,4 @@
-"""Meshes and clouds of results, and how far one surface lies from another. Pure but for reading."""
+"""Meshes and clouds of results, and distances between surfaces. Pure but for reading."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Faces = NDArray[np.int32]
 _NEIGHBOURS = 4
 """Triangles of so many near vertices: the nearest point lies on one of them."""
 _TRIMMED = 0.7
-"""The share of the body that is aligned: arms that were held elsewhere must not pull it."""
+"""The share of the body that is aligned: arms in a different position must not affect it."""
 _ROUNDS = 12
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
@@ -55,7 +55,7 @@ def read_mesh(path: Path) -> Surface:
 
 
 def aligned(moving: Surface, target: Surface) -> Surface:
-    """A surface laid over another one as a rigid whole.
+    """A surface rigidly aligned to another one.
 
     Both have one template's topology, so their vertices correspond: Kabsch's rotation, least
     squares over the 70 % that lie nearest (trimmed, after Chetverikov et al. 2002). Surfaces of

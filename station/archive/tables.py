@@ -20,7 +20,7 @@ FILES: dict[Pose, str] = {
 }
 PER_METRE: dict[Unit, float] = {"m": 1.0, "cm": 100.0, "in": 1 / 0.0254}
 DIGITS: dict[Unit, int] = {"m": 4, "cm": 1, "in": 2}
-"""A tenth of a millimetre, a millimetre, a quarter of one: finer than any interval."""
+"""Decimals of each unit; finer than any interval."""
 _HEADS = {
     "en": ("order", "date", "verdict", "pose", "measurement", "side", "value", "low", "high",
            "unit", "basis", "standard"),
@@ -82,7 +82,7 @@ def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any
 def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: Language) -> str:
     """A line for each measurement, each with the order, the date, the verdict and the pose.
 
-    Begins with a byte order mark: without one spreadsheets take UTF-8 for something else.
+    Begins with a byte order mark: without one, spreadsheets misread UTF-8.
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\r\n")
@@ -98,5 +98,5 @@ def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: 
 
 
 def _harmless(text: str) -> str:
-    """A label is somebody's text: a spreadsheet must not take it for a formula."""
+    """A label is arbitrary text: a spreadsheet must not interpret it as a formula."""
     return f"'{text}" if text.startswith(_FORMULA) else text

@@ -1,4 +1,4 @@
-"""Names of measurements: plain ones in two languages, and SeamlyMe's. The one table."""
+"""Names of measurements: plain names in two languages, and SeamlyMe's."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def split_side(name: str) -> tuple[str, Side]:
 
 
 def plain_name(name: str, language: Language = "en", *, with_side: bool = True) -> str:
-    """A row's name as a tailor reads it; one that the table does not know is spelt out."""
+    """A row's name as a tailor reads it; a name that is not in the table is spelt out."""
     stem, side = split_side(name)
     term = TERMS.get(stem)
     words = term.words(language) if term else stem.replace("_", " ").capitalize()

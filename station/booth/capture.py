@@ -1,4 +1,4 @@
-"""The capture process: one sensor through its driver, its frames published as they come."""
+"""The capture process: one sensor through its driver, its frames published as they arrive."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from station.sensors.registry import make_driver
 _READ_TIMEOUT_S = 0.1
 _BACK_OFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 _OPENING_S = 60.0
-"""USB may take seconds to open a sensor; a simulated one is rendered first."""
+"""Opening a USB sensor may take seconds; a simulated one is rendered first."""
 
 
 class CaptureProcess:
@@ -53,12 +53,12 @@ class CaptureProcess:
         self._heart = Heartbeat(folder, f"capture {name}")
 
     def run(self, stop: threading.Event) -> None:
-        """Until told to stop."""
+        """Run until told to stop."""
         self._heart.ready()
         try:
             while not stop.is_set():
                 self._heart.beat()
-                self._follow_wishes()
+                self._follow_desired_state()
                 if not self._streaming:
                     self._close("off")
                     stop.wait(_READ_TIMEOUT_S)
@@ -66,12 +66,12 @@ class CaptureProcess:
                     self._open(stop)
                 else:
                     self._read()
-                self._tell_health()
+                self._report_health()
         finally:
             self._close("off")
             self._context.destroy(linger=0)
 
-    def _follow_wishes(self) -> None:
+    def _follow_desired_state(self) -> None:
         while self._wishes.poll(0):
             try:
                 wish = DesiredState.unpack(self._wishes.recv_multipart()[-1])
@@ -86,7 +86,7 @@ class CaptureProcess:
             stop.wait(_READ_TIMEOUT_S)
             return
         self._state, self._detail = "opening", ""
-        self._tell_health(now=True)
+        self._report_health(now=True)
         driver = make_driver(self._camera)
         self._heart.allow(_OPENING_S)
         try:
@@ -98,11 +98,11 @@ class CaptureProcess:
             self._heart.allow(None)
         self._driver = driver
         if self._clock is not None:
-            # A sensor that comes back may count from anywhere.
+            # A reconnected sensor may start counting anywhere.
             self._past_resets = self._clock_resets() + 1
         self._clock = DeviceClock(self._info.tick_hz, self._info.tick_bits)
         self._last_sequence = None
-        self._tell_health(now=True)
+        self._report_health(now=True)
         self._log.info("streaming from %s", self._info.serial)
 
     def _read(self) -> None:
@@ -117,7 +117,7 @@ class CaptureProcess:
             self._state, self._detail, self._failures = "streaming", "", 0
             self._publish(frame)
             if first:
-                self._tell_health(now=True)
+                self._report_health(now=True)
 
     def _publish(self, frame: DepthFrame) -> None:
         info, clock = self._info, self._clock
@@ -152,8 +152,8 @@ class CaptureProcess:
         self._failures += 1
         self._open_at_s = time.monotonic() + wait_s
         self._state, self._detail = "lost", str(error)
-        self._log.warning("%s; next try in %.1f s", error, wait_s)
-        self._tell_health(now=True)
+        self._log.warning("%s; retrying in %.1f s", error, wait_s)
+        self._report_health(now=True)
 
     def _close(self, state: str) -> None:
         if self._driver is not None:
@@ -161,7 +161,7 @@ class CaptureProcess:
             self._driver = None
         self._state, self._detail, self._failures, self._open_at_s = state, "", 0, 0.0
 
-    def _tell_health(self, now: bool = False) -> None:
+    def _report_health(self, now: bool = False) -> None:
         moment = time.monotonic()
         if not now and moment - self._told_s < 1.0 / TOPICS["health"].rate_hz:
             return
@@ -172,7 +172,7 @@ class CaptureProcess:
         self._out.send_multipart([self._health_topic, health.pack()])
         if self._info is not None:
             self._out.send_multipart([self._sensor_topic, self._sensor(self._info).pack()])
-        self._heart.tell(
+        self._heart.report(
             {
                 "state": self._state,
                 "detail": self._detail,

@@ -10,17 +10,18 @@ from station.core.rig import Rig
 from station.core.scans import ScanId
 from station.messaging.intake import LiveFrame
 
-LATE = "the order came too late and was not taken up; scan again"
+LATE = "the request for this scan expired before the scan was started; scan again"
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A scan that the operator wants."""
+    """The operator's request for a scan."""
 
     scan_id: ScanId
     label: str
     valid_until_s: float
-    """Taken up later it is void: the operator was told that nothing came of it."""
+    """Deadline for starting the scan; after it the operator has been told that the request
+    expired."""
 
     def late(self, now_s: float) -> bool:
         return now_s > self.valid_until_s
@@ -36,10 +37,10 @@ class Collection:
     deadline_s: float
     sets: list[Frameset[LiveFrame]] = field(default_factory=list)
     complete_s: float = 0.0
-    """Time at which its last frameset came."""
+    """Time at which its last frameset arrived."""
 
     def add(self, found: Frameset[LiveFrame], now_s: float) -> bool:
-        """Take a frameset; True when it was the last one."""
+        """Add a frameset; True if it was the last one."""
         self.sets.append(found)
         self.complete_s = now_s
         return len(self.sets) >= self.wanted
@@ -49,12 +50,12 @@ class Collection:
         return next(iter(self.sets[0].frames.values())).header.depth_scale_m
 
     def too_few(self, silent: Sequence[str], troubles: Sequence[str], within_s: float) -> str:
-        """Why the framesets did not come in time."""
+        """Reason why the framesets did not arrive in time."""
         if troubles:
             return "; ".join(troubles)
         if silent:
             return f"camera {', '.join(silent)} went silent; check its cable and scan again"
         return (
-            f"only {len(self.sets)} of {self.wanted} framesets came in {within_s:g} s; "
-            "check station status and scan again"
+            f"only {len(self.sets)} of {self.wanted} framesets arrived within {within_s:g} s; see "
+            "station status, then scan again"
         )

@@ -1,5 +1,5 @@
-"""The operator's endpoint: start, stop, scan, cancel, status. Every command is answered, and twice
-the same does no harm.
+"""The operator's endpoint: start, stop, scan, cancel, status. Every command is answered, and
+repeating one is harmless.
 
 Commands are `Request` messages to the socket `control` in the runtime folder, answers `Reply`
 messages (`station.messaging`). Their content:
@@ -10,8 +10,8 @@ messages (`station.messaging`). Their content:
                          state, also a refusal, is asked for with scan-status
     status               `station.booth.health.BoothHealth`
 
-Control remembers nothing of scans: orders are notes in the spool, sync gives the verdict, and
-both outlive this process. Scans by label and time: `station.archive`.
+Control keeps no state of scans: orders are notes in the spool, sync decides their outcome, and both
+outlive this process. Scans by label and time: `station.archive`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _PROGRESS_KEPT = 100
 
 
 class ControlProcess:
-    """Holds what the operator wants, and tells what became of each scan."""
+    """Keeps the desired state of the sensors, and reports the state of each scan."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
@@ -71,7 +71,7 @@ class ControlProcess:
         self._heart = Heartbeat(self._folder, "control")
 
     def run(self, stop: threading.Event) -> None:
-        """Until told to stop."""
+        """Run until told to stop."""
         poller = zmq.Poller()
         for socket in (self._requests, self._events, self._orders):
             poller.register(socket, zmq.POLLIN)
@@ -79,32 +79,33 @@ class ControlProcess:
         while not stop.is_set():
             ready = dict(poller.poll(_POLL_MS))
             if self._events in ready:
-                self._hear()
+                self._receive()
             if self._orders in ready:
-                self._orders.recv_multipart()  # sync's word on an order is on disk
+                self._orders.recv_multipart()  # sync's decision on an order is on disk
             if self._requests in ready:
                 self._answer()
             now_s = time.monotonic()
             if now_s - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
-                self._wish()
+                self._publish_desired()
             if now_s - self._tidied_s > _TIDY_PERIOD_S:
                 self._tidied_s = now_s
                 self._tidy()
             self._heart.beat()
             if self._heart.due:
-                self._heart.tell(
+                self._heart.report(
                     {"streaming": self._streaming, "unreadable_messages": self._unreadable}
                 )
         self._context.destroy(linger=0)
 
     def _remembered(self) -> bool:
-        """The operator's last order: a restarted control must not stop the sensors."""
+        """The operator's last start or stop: a restarted control process must not stop the
+        sensors."""
         try:
             return bool(json.loads(self._memory.read_text())["streaming"])
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
-    def _wish(self) -> None:
+    def _publish_desired(self) -> None:
         self._wished_s = time.monotonic()
         self._wishes.send_multipart([b"desired", DesiredState(self._streaming).pack()])
 
@@ -112,11 +113,11 @@ class ControlProcess:
         try:
             self._spool.sweep()
             for folder in expire_old(self._spool, self._config.retention):
-                self._log.info("removed %s: its retention period is over", folder)
+                self._log.info("removed %s: its retention period has ended", folder)
         except OSError as error:
-            self._log.warning("old scans are not removed: %s", error)
+            self._log.warning("old scans could not be removed: %s", error)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         parts = self._events.recv_multipart()
         try:
             event = ScanEvent.unpack(parts[-1])
@@ -139,20 +140,20 @@ class ControlProcess:
         except OSError as error:
             reply = Reply(
                 ok=False,
-                error=f"the disk refuses ({error.strerror or error}: {error.filename or 'spool'}); "
-                "free or mend it, see station status",
+                error=f"the disk cannot be written ({error.strerror or error}: "
+                f"{error.filename or 'spool'}); free some space or repair it, see station status",
             )
         try:
             self._requests.send_multipart([*route, reply.pack()])
         except zmq.ZMQError as error:
-            # Who asked is gone, or gave no address to answer to.
-            self._log.info("an answer could not be sent (%s)", error)
+            # The sender is gone, or gave no address to reply to.
+            self._log.info("a reply could not be sent (%s)", error)
 
     def _reply(self, request: Request) -> Reply:
         if request.command in ("start", "stop"):
             self._streaming = request.command == "start"
             write_json(self._memory, {"streaming": self._streaming})
-            self._wish()
+            self._publish_desired()
             return Reply(ok=True, content={"streaming": self._streaming})
         if request.command == "scan":
             return self._scan(request)
@@ -163,10 +164,10 @@ class ControlProcess:
         if request.command == "status":
             health = booth_health(self._config)
             return Reply(ok=True, content={**asdict(health), "streaming": self._streaming})
-        return Reply(ok=False, error=f"control knows no command {request.command!a:.80}")
+        return Reply(ok=False, error=f"control does not know the command {request.command!a:.80}")
 
     def _scan(self, request: Request) -> Reply:
-        """Note an order and pass it on; only sync says what becomes of it."""
+        """Record an order and pass it on; only sync decides its outcome."""
         scan_id = scan_id_of(request.scan_id)
         if self._session(scan_id) is not None:
             return Reply(ok=True, content=self._scan_status(scan_id))
@@ -176,7 +177,7 @@ class ControlProcess:
         valid_until_s = request.valid_until_s or now_s + self._config.runtime.command_timeout_s
         if now_s > valid_until_s:
             return Reply(
-                ok=False, error=f"the order of scan {scan_id} came too late; nothing was begun"
+                ok=False, error=f"the request for scan {scan_id} expired; no scan was started"
             )
         note = ScanNote(
             scan_id, "armed", label=request.label, valid_until_s=valid_until_s, boot=boot_id()
@@ -186,17 +187,18 @@ class ControlProcess:
         return Reply(ok=True, content=self._scan_status(scan_id))
 
     def _pass_on(self, note: ScanNote) -> None:
-        """Send an order to sync, without waiting: sync may be starting again just now."""
+        """Send an order to sync, without waiting: sync may be restarting."""
         self._reminded_s = {note.scan_id: time.monotonic()}
         valid_until_s = note.valid_until_s if note.boot == boot_id() else -1.0
         request = Request("scan", note.scan_id, note.label, valid_until_s)
         try:
             self._orders.send_multipart([b"", request.pack()], zmq.NOBLOCK)
         except zmq.Again:
-            self._log.warning("sync takes no orders just now")
+            self._log.warning("sync is not accepting requests at the moment")
 
     def _cancel(self, request: Request) -> Reply:
-        """Give a scan up while it is taken or waits; later there is a result, to be purged."""
+        """Cancel a scan that is being taken or waiting; a later one has a result, which can be
+        purged."""
         scan_id = scan_id_of(request.scan_id)
         status = self._scan_status(scan_id)
         if status["state"] == "failed":
@@ -205,13 +207,13 @@ class ControlProcess:
             answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
             if not answer.ok:
                 return answer
-            # Sync's verdict is on its way to the disk.
+            # Sync is still writing its decision to disk.
             return Reply(ok=True, content={**status, "reason": CANCELLED})
         if status["state"] != "accepted" or not self._spool.withdraw(scan_id, CANCELLED):
             return Reply(
                 ok=False,
-                error=f"scan {scan_id} is past cancelling (it is {status['state']}); "
-                f"delete it when it is done: station purge {scan_id}",
+                error=f"scan {scan_id} can no longer be cancelled (its state is "
+                f"{status['state']}); when it is done, delete it with: station purge {scan_id}",
             )
         return Reply(ok=True, content=self._scan_status(scan_id))
 
@@ -219,18 +221,18 @@ class ControlProcess:
         """A scan's state as the disk has it.
 
         Raises:
-            BoothError: nobody knows the scan.
+            BoothError: there is no such scan.
         """
         session = self._session(scan_id)
         if session is None:
-            raise BoothError(f"scan {scan_id} is unknown here; see station list")
+            raise BoothError(f"there is no scan {scan_id}; see station list")
         return asdict(session)
 
     def _session(self, scan_id: ScanId) -> Session | None:
         note = self._spool.notes.read(scan_id)
         place = self._spool.where(scan_id)
         if place is None:
-            # It may have got its verdict between the two looks.
+            # It may have ended between the two reads.
             note = self._spool.notes.read(scan_id)
         state = state_of(note, place)
         if state is None:

@@ -29,7 +29,7 @@ class FramesetMatcher(Generic[Frame]):
 
     A set is complete when the heads of all queues lie within the tolerance and no camera's next
     frame would make it tighter; the earliest head is dropped while they do not. Queues are short:
-    a camera that stays behind costs its own frames, never memory.
+    a camera that lags behind loses its own frames and uses no memory.
     """
 
     def __init__(self, cameras: Iterable[str], tolerance_s: float) -> None:
@@ -44,11 +44,11 @@ class FramesetMatcher(Generic[Frame]):
         last_s = self._last_s.get(camera, -inf)
         self._last_s[camera] = time_s
         if time_s == last_s:
-            # The same frame once more.
+            # The same frame again.
             self.dropped[camera] += 1
             return []
         if time_s < last_s:
-            # A clock that was reset, or a replay that began anew: what waited is of the past.
+            # A clock that was reset, or a replay that started over: waiting frames are outdated.
             self.dropped[camera] += len(queue)
             queue.clear()
         queue.append((time_s, frame))
@@ -68,7 +68,7 @@ class FramesetMatcher(Generic[Frame]):
         return found
 
     def clear(self) -> None:
-        """Forget what waits: it belongs to the time before."""
+        """Discard all waiting frames."""
         for queue in self._queues.values():
             queue.clear()
 

@@ -1,7 +1,7 @@
 """The booth's state, from its processes' own reports and from the spool.
 
-Needs no process to answer: a hung one is seen by its age. `station status` prints it, control's
-`status` command returns it, and the metrics are made from it.
+No process has to respond: a hung one is recognised by the age of its report. `station status`
+prints it, control's `status` command returns it, and the metrics are made from it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from station.core.config import BoothConfig
 from station.core.service import read_health
 from station.core.spool import STATES, count_scans
 
-MOST_AGE_S = 3.0
-"""A process tells its health four times a second; older says that it hangs or is gone."""
+MAX_AGE_S = 3.0
+"""A process reports four times a second; an older report means that it hangs or is gone."""
 _STUCK_S = 60.0
-"""Beyond its time limit, a claimed scan that nobody ends."""
+"""Time beyond its limit after which a claimed scan counts as stuck."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class BoothHealth:
     processes: dict[str, dict[str, Any]]
     """Last report of each process, with `age_s`; {} for a process without a report."""
     sync: dict[str, Any]
-    """Cameras, framesets and latencies; {"error"} while sync gives no word."""
+    """Cameras, framesets and latencies; {"error"} while sync does not report."""
     spool: dict[str, int]
     """Scans in each folder."""
     oldest_waiting_s: float
@@ -46,8 +46,8 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     processes = {service.name: read_health(folder, service.name) for service in services(config)}
     problems = _silent(processes)
     sync = processes["sync"]
-    if not sync or sync["age_s"] > MOST_AGE_S:
-        sync = {"error": "the sync process gives no word of cameras and framesets"}
+    if not sync or sync["age_s"] > MAX_AGE_S:
+        sync = {"error": "the sync process is not reporting on cameras and framesets"}
     for name, camera in sync.get("cameras", {}).items():
         if camera["trouble"]:
             problems.append(f"camera {name}: {camera['trouble']}")
@@ -59,17 +59,17 @@ def booth_health(config: BoothConfig) -> BoothHealth:
 
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
-    """The processes that say nothing, with what to do."""
+    """Messages about processes that do not report, with remedies."""
     if not any(processes.values()):
-        return ["no process of the booth runs here; start it: station run"]
+        return ["no process of the booth is running here; start it with: station run"]
     return [
-        f"the {name} process has said nothing for {content['age_s']:.0f} s; it is started again "
-        "by itself, else: station run"
+        f"the {name} process has not reported for {content['age_s']:.0f} s; it is restarted "
+        "automatically under station run or systemd"
         if content
-        else f"the {name} process does not run; its log says why: journalctl -u 'booth-*', or the "
+        else f"the {name} process is not running; see journalctl -u 'booth-*', or the "
         "terminal of station run"
         for name, content in processes.items()
-        if not content or content["age_s"] > MOST_AGE_S
+        if not content or content["age_s"] > MAX_AGE_S
     ]
 
 
@@ -94,8 +94,8 @@ def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], flo
         return {}, 0.0, [], 0
     if free < config.spool.min_free_mb * 1e6:
         problems.append(
-            f"{folder} has {free / 1e6:.0f} MB free, scans are refused below "
-            f"{config.spool.min_free_mb:.0f} MB; free some space, or: station purge --old"
+            f"{folder} has {free / 1e6:.0f} MB free and scans are refused below "
+            f"{config.spool.min_free_mb:.0f} MB; free some space or run: station purge --old"
         )
     problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
     return (

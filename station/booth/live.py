@@ -36,7 +36,7 @@ def merged_points(
 
 
 class LiveCloud:
-    """A frameset now and then as a cloud, once there is a calibration."""
+    """Converts a frameset to a cloud now and then, once there is a calibration."""
 
     def __init__(self, calibration: Path, rate_hz: float) -> None:
         self._calibration, self._period_s = calibration, 1.0 / rate_hz

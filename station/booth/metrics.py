@@ -1,4 +1,4 @@
-"""The booth's health as Prometheus metrics on a local endpoint; no label tells of a person."""
+"""The booth's health as Prometheus metrics on a local endpoint; no label identifies a person."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOCAL = "127.0.0.1"
 
 
 class BoothCollector(Collector):
-    """Looks at the booth when it is asked."""
+    """Reads the booth's state whenever metrics are requested."""
 
     def __init__(self, config: BoothConfig) -> None:
         self._config = config
@@ -30,12 +30,14 @@ class BoothCollector(Collector):
 
 def _processes(health: BoothHealth) -> Iterator[Metric]:
     age = GaugeMetricFamily(
-        "booth_process_age_seconds", "since a process last told its health", labels=["process"]
+        "booth_process_age_seconds", "time since the last report of a process", labels=["process"]
     )
     for name, content in health.processes.items():
         age.add_metric([name], content.get("age_s", float("inf")))
     yield age
-    yield GaugeMetricFamily("booth_problems", "what is wrong now", value=len(health.problems))
+    yield GaugeMetricFamily(
+        "booth_problems", "number of current problems", value=len(health.problems)
+    )
 
 
 def _cameras(health: BoothHealth) -> Iterator[Metric]:
@@ -43,9 +45,11 @@ def _cameras(health: BoothHealth) -> Iterator[Metric]:
         CounterMetricFamily(f"booth_frames_{what}", f"frames {what}", labels=["camera"])
         for what in ("received", "lost", "unmatched")
     )
-    rate = GaugeMetricFamily("booth_frame_rate_hertz", "by the device's clock", labels=["camera"])
+    rate = GaugeMetricFamily(
+        "booth_frame_rate_hertz", "frame rate by the device's clock", labels=["camera"]
+    )
     age = GaugeMetricFamily(
-        "booth_frame_age_seconds", "since the last frame came", labels=["camera"]
+        "booth_frame_age_seconds", "time since the last frame arrived", labels=["camera"]
     )
     for name, camera in health.sync.get("cameras", {}).items():
         frames.add_metric([name], camera["frames"])
@@ -69,7 +73,9 @@ def _spool(health: BoothHealth) -> Iterator[Metric]:
         "booth_oldest_waiting_seconds", "age of the oldest waiting scan",
         value=health.oldest_waiting_s,
     )  # fmt: skip
-    yield GaugeMetricFamily("booth_stuck_scans", "claims that do not end", value=len(health.stuck))
+    yield GaugeMetricFamily(
+        "booth_stuck_scans", "claimed scans that should have ended", value=len(health.stuck)
+    )
     yield GaugeMetricFamily(
         "booth_spool_free_bytes", "free space of the spool's disk", value=health.free_bytes
     )

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from station.booth.health import MOST_AGE_S, booth_health
+from station.booth.health import MAX_AGE_S, booth_health
 from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
@@ -24,8 +24,8 @@ from station.messaging.transport import STATION_LOCK, NoAnswerError, ask
 _POLL_S = 0.05
 _EXIT_RESCAN = 3
 _UNSURE_S = 15.0
-"""A process that hangs is replaced within this time, and then says what became of a scan."""
-_MOST_LETTERS = 200
+"""Time within which a process that hangs is restarted and the outcome of a scan is known again."""
+_MAX_LABEL_LENGTH = 200
 _LOCKS = (STATION_LOCK, "control.lock", "sync.lock")
 _WORDS = {
     "armed": "waiting for the cameras",
@@ -50,7 +50,7 @@ def _command(config: BoothConfig, request: Request) -> dict[str, Any]:
 @config_option
 @click.option("--timeout", "timeout_s", default=20.0, help="seconds to wait for all cameras")
 def start(config_path: Path | None, timeout_s: float) -> None:
-    """Start the sensors and wait until every camera gives frames.
+    """Start the sensors and wait until every camera sends frames.
 
     \b
     Examples:
@@ -69,7 +69,7 @@ def start(config_path: Path | None, timeout_s: float) -> None:
             break
         for name in silent:
             detail = sync.get("cameras", {}).get(name, {}).get("detail")
-            # Between two tries a camera has nothing to say; what it said last still holds.
+            # Between two attempts a camera reports no detail; its last one still applies.
             if detail and troubles.get(name) != detail:
                 troubles[name] = detail
                 click.echo(f"  camera {name}: {detail}; trying again", err=True)
@@ -84,7 +84,7 @@ def start(config_path: Path | None, timeout_s: float) -> None:
 @click.command()
 @config_option
 def stop(config_path: Path | None) -> None:
-    """Stop the sensors; scans that were accepted go on.
+    """Stop the sensors; accepted scans are still reconstructed.
 
     \b
     Examples:
@@ -99,7 +99,7 @@ def stop(config_path: Path | None) -> None:
 @click.argument("scan_id")
 @config_option
 def cancel(scan_id: str, config_path: Path | None) -> None:
-    """Give up a scan that is being taken or waits for its reconstruction.
+    """Cancel a scan that is being taken or is waiting to be reconstructed.
 
     \b
     Examples:
@@ -112,11 +112,11 @@ def cancel(scan_id: str, config_path: Path | None) -> None:
 
 @click.command()
 @config_option
-@click.option("--json", "as_json", is_flag=True, help="for programs")
+@click.option("--json", "as_json", is_flag=True, help="print JSON")
 def status(config_path: Path | None, as_json: bool) -> None:
     """Show processes, cameras, framesets and the spool, and what is wrong with them.
 
-    Exit code 1: the station does not answer; what is known of it is shown all the same.
+    Exit code 1: the station does not respond; what is known about it is shown anyway.
 
     \b
     Examples:
@@ -142,11 +142,11 @@ def _show_status(content: Mapping[str, Any]) -> None:
     if streaming is not None:
         click.echo("sensors " + ("started" if streaming else "stopped"))
     if any(content["processes"].values()):
-        click.echo(f"  {'process':<22} {'state':<10} last word")
+        click.echo(f"  {'process':<22} {'state':<10} last report")
         for name, told in content["processes"].items():
-            alive = bool(told) and told["age_s"] <= MOST_AGE_S
+            alive = bool(told) and told["age_s"] <= MAX_AGE_S
             age = f"{told['age_s']:.0f} s ago" if told else "never"
-            click.echo(f"  {name:<22} {'runs' if alive else 'SILENT':<10} {age}")
+            click.echo(f"  {name:<22} {'running' if alive else 'SILENT':<10} {age}")
     cameras = content["sync"].get("cameras", {})
     if cameras:
         click.echo(f"  {'camera':<22} {'state':<10} {'frames':>8} {'lost':>6} {'Hz':>5}")
@@ -172,8 +172,10 @@ def _show_status(content: Mapping[str, Any]) -> None:
 
 @click.command()
 @config_option
-@click.option("--label", default="", help="whose scan it is; kept in the bundle")
-@click.option("--scan-id", default=None, help="repeat a command for the same scan")
+@click.option(
+    "--label", default="", help="whose scan it is, e.g. an order number; stored with the scan"
+)
+@click.option("--scan-id", default=None, help="scan id, to repeat a command for the same scan")
 @click.option("--wait/--no-wait", default=True, help="wait for the result")
 @click.option("--timeout", "timeout_s", default=180.0, help="seconds to wait for the result")
 def scan(
@@ -193,14 +195,14 @@ def scan(
     began_s = time.monotonic()
     valid_until_s = began_s + config.runtime.command_timeout_s
     order = Request("scan", scan_id, _text(label), valid_until_s)
-    session = _patiently(config, order)
+    session = _ask_until_answered(config, order)
     click.echo(f"scan {scan_id}")
     try:
         session = _follow(config, scan_id, session, _enough(wait), began_s + timeout_s)
     except KeyboardInterrupt:
         raise BoothError(
-            f"scan {scan_id} goes on without this command; its state: station find {scan_id}; "
-            f"give it up: station cancel {scan_id}"
+            f"scan {scan_id} continues without this command; see its state with: station find "
+            f"{scan_id}; cancel it with: station cancel {scan_id}"
         ) from None
     if session["state"] == "failed":
         raise BoothError(f"scan {scan_id} failed: {session['reason']}")
@@ -236,7 +238,7 @@ def _follow(
         elif time.monotonic() - sure_s > _UNSURE_S:
             raise UnsureError(scan_id)
         if state in ON_DISK and state != "accepted" and not free:
-            # The scan was quicker than the question: the person waits for this word.
+            # The scan ended before this poll; the person waits for this message.
             click.echo(f"  {_WORDS['accepted']:<44}")
         free = free or state in ON_DISK
         words = _WORDS.get(state, state)
@@ -253,24 +255,26 @@ def _follow(
         if enough(state):
             return session
         if time.monotonic() > deadline_s:
-            raise BoothError(f"scan {scan_id} is {state} and not done in time; see station status")
+            raise BoothError(
+                f"scan {scan_id} was not done in time (its state is {state}); see station status"
+            )
         time.sleep(_POLL_S)
-        session = _patiently(config, Request("scan-status", scan_id))
+        session = _ask_until_answered(config, Request("scan-status", scan_id))
 
 
 class UnsureError(BoothError):
-    """Nobody could say in time what became of a scan."""
+    """The outcome of a scan could not be determined in time."""
 
     def __init__(self, scan_id: str) -> None:
-        super().__init__(f"scan {scan_id}: {UNSURE} before station status, or list {scan_id}, says")
+        super().__init__(f"scan {scan_id}: {UNSURE}; see station status and station find {scan_id}")
 
 
-def _patiently(config: BoothConfig, request: Request) -> dict[str, Any]:
-    """Control's answer on a scan, asked for until it comes: the same order twice is one scan.
+def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]:
+    """Control's reply about a scan, retried until it arrives: a repeated order is the same scan.
 
     Raises:
-        UnsureError: it did not come; the scan may be taken all the same.
-        BoothError: control refused; nothing was begun.
+        UnsureError: it did not arrive; the scan may be taken anyway.
+        BoothError: control refused; no scan was started.
     """
     deadline_s = time.monotonic() + _UNSURE_S
     told = False
@@ -279,7 +283,7 @@ def _patiently(config: BoothConfig, request: Request) -> dict[str, Any]:
             return _command(config, request)
         except NoAnswerError:
             if not told and not any(is_held(config.runtime.folder / lock) for lock in _LOCKS):
-                # No station runs here: the order reached nobody.
+                # No station is running here: nobody received the order.
                 raise
             if time.monotonic() > deadline_s:
                 raise UnsureError(request.scan_id) from None
@@ -289,9 +293,9 @@ def _patiently(config: BoothConfig, request: Request) -> dict[str, Any]:
 
 
 def _text(label: str) -> str:
-    """A label of letters that can be written and printed."""
+    """A label, with unprintable characters removed."""
     text = label.encode(errors="surrogateescape").decode(errors="replace")
-    return "".join(letter if letter.isprintable() else " " for letter in text)[:_MOST_LETTERS]
+    return "".join(letter if letter.isprintable() else " " for letter in text)[:_MAX_LABEL_LENGTH]
 
 
 def _show_result(path: str) -> None:

@@ -19,7 +19,7 @@ import click
 from station.archive.index import ScanIndex
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
-from station.core.files import held, read_small, write_json
+from station.core.files import held, read_bounded_json, write_json
 from station.core.scans import ScanId, boot_id, scan_id_of
 from station.core.spool import STATES, Spool
 
@@ -27,11 +27,11 @@ FILE = "retention.json"
 LONGEST_OFF_S = 4 * 86_400.0
 """A long weekend."""
 _DAY_S = 86_400.0
-_MOST_OF_A_LABEL = 10_000
-_MOST_BYTES = 16 << 20
-_BUSY = SpoolError("old scans are being removed just now; do it again")
+_MAX_LABEL_LENGTH = 10_000
+_MAX_BYTES = 16 << 20
+_BUSY = SpoolError("old scans are being removed at the moment; try again")
 _ORDER_S = 60.0
-"""So long after its order a scan without a bundle is not being taken any more."""
+"""Time after which a scan without a bundle is no longer being taken, from its order on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,9 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
     }
     with held(spool.folder / "retention.lock", _BUSY):
         ages = advance(_load(spool), now or Moment.now())
-        folders = [f"{state}/{folder.name}" for state, folder in spool.every() if state in limits_s]
+        folders = [
+            f"{state}/{folder.name}" for state, folder in spool.all_scans() if state in limits_s
+        ]
         folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
         ages, old = due(ages, folders, limits_s)
         removed = []
@@ -117,13 +119,13 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
 
 def _load(spool: Spool) -> Ages:
     try:
-        document: dict[str, Any] = read_small(spool.folder / FILE, _MOST_BYTES)
+        document: dict[str, Any] = read_bounded_json(spool.folder / FILE, _MAX_BYTES)
         seen = {str(name): float(value) for name, value in document["seen_s"].items()}
         last = document["last"]
         moment = Moment(float(last["wall_s"]), float(last["since_boot_s"]), str(last["boot"]))
         return Ages(float(document["counted_s"]), moment, seen)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        # All begin to age now: that deletes late, never early.
+        # All start to age now, which deletes late, never early.
         return Ages()
 
 
@@ -157,7 +159,7 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
     """Delete a scan: its bundle, its results, its note and its name.
 
     Raises:
-        InputError: it is no scan id.
+        InputError: it is not a valid scan id.
         SpoolError: there is no such scan, or it is being taken or reconstructed.
     """
     name = scan_id_of(scan_id)
@@ -179,7 +181,7 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
             else:
                 path.unlink()
         with held(
-            spool.folder / "retention.lock", SpoolError("old scans are being removed; again")
+            spool.folder / "retention.lock", SpoolError("old scans are being removed; retrying")
         ):
             _save(spool, _load(spool))
     finally:
@@ -194,7 +196,8 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
 @click.option("--label", help="delete all scans with exactly this label")
 @click.option("--old", is_flag=True, help="remove everything past its retention period")
 def purge(scan_id: str | None, config_path: Path | None, label: str | None, old: bool) -> None:
-    """Delete a scan and its results, all scans of a label, or all that are past their time.
+    """Delete a scan and its results, all scans with a label, or all that are past their retention
+    period.
 
     \b
     Examples:
@@ -212,14 +215,14 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         removed = purge_scan(spool, scan_id)
     else:
         removed = _purge_label(spool, str(label))
-    # Its labels go with the scans, now and not at the next look.
+    # Labels leave the index together with the scans, not at the next query.
     ScanIndex(spool).find(limit=0)
     for folder in removed:
         click.echo(f"removed {folder}")
 
 
 def _purge_label(spool: Spool, label: str) -> list[Path]:
-    found = ScanIndex(spool).find(label=label, limit=_MOST_OF_A_LABEL)
+    found = ScanIndex(spool).find(label=label, limit=_MAX_LABEL_LENGTH)
     if not found:
         raise SpoolError(f"there is no scan with the label {label!r}; see station list")
     return [folder for scan in found for folder in purge_scan(spool, scan.scan_id)]
@@ -237,4 +240,4 @@ def retry(scan_id: str, config_path: Path | None) -> None:
     """
     config = load_config(find_config(config_path))
     Spool(config.spool.folder).retry(scan_id_of(scan_id))
-    click.echo(f"scan {scan_id} waits for its reconstruction")
+    click.echo(f"scan {scan_id} is waiting to be reconstructed")

@@ -1,7 +1,7 @@
-"""The disk's part of taking a scan: orders noted, bundles written, verdicts given.
+"""Disk operations of taking a scan: notes on orders, bundles, outcomes.
 
-Everything here runs in one thread beside the frames: a stalled disk delays a verdict, it loses no
-frame and changes no verdict. Who collects frames hears through `events`.
+Everything here runs in one thread beside the frames: a stalled disk delays an outcome, but loses no
+frame and changes no outcome. The collecting thread is informed through `events`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _ENDED = "the station was interrupted during the scan; scan again"
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
-    """An order is noted: its frames may be collected."""
+class Started:
+    """An order is recorded: its frames may be collected."""
 
     order: Order
     rig: Rig
@@ -40,7 +40,7 @@ class Begun:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """A scan has its verdict."""
+    """A scan has its outcome."""
 
     scan_id: ScanId
     accepted: bool
@@ -48,36 +48,36 @@ class Ended:
 
 
 class ScanWriter:
-    """Works orders and collections off, one after the other."""
+    """Processes orders and collections one after another."""
 
     def __init__(self, config: BoothConfig, drift: DriftWatch, log: logging.Logger) -> None:
         self._config, self._drift, self._log = config, drift, log
         self._names = [camera.name for camera in config.cameras]
         self._spool = Spool(config.spool.folder)
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._events: queue.SimpleQueue[Begun | Ended] = queue.SimpleQueue()
+        self._events: queue.SimpleQueue[Started | Ended] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="scan writer", daemon=True)
         self._thread.start()
         self._tasks.put(self._settle_abandoned)
 
     def begin(self, order: Order) -> None:
-        """Note that an order is taken up; `Begun` or `Ended` follows."""
+        """Record that an order is started; `Started` or `Ended` follows."""
         self._tasks.put(partial(self._guarded, order, partial(self._begin, order)))
 
     def refuse(self, order: Order, reason: str) -> None:
-        """Give an order that was not taken up its verdict."""
+        """Record that an order was refused."""
         self._tasks.put(partial(self._refuse, order, reason))
 
     def fail(self, order: Order, reason: str) -> None:
-        """Give a scan that is being collected its verdict."""
+        """Record that a scan failed while it was being collected."""
         self._tasks.put(partial(self._failed, order, reason))
 
     def write(self, collection: Collection) -> None:
         """Write a complete collection's bundle; `Ended` follows."""
         self._tasks.put(partial(self._guarded, collection.order, partial(self._write, collection)))
 
-    def events(self) -> Iterator[Begun | Ended]:
+    def events(self) -> Iterator[Started | Ended]:
         """Events since the last call."""
         while True:
             try:
@@ -86,7 +86,7 @@ class ScanWriter:
                 return
 
     def close(self) -> None:
-        """End after what is being written."""
+        """End after the current write."""
         self._tasks.put(None)
         self._stop.set()
         self._thread.join()
@@ -96,10 +96,10 @@ class ScanWriter:
             try:
                 task()
             except Exception:
-                self._log.exception("a scan's verdict could not be given")
+                self._log.exception("the outcome of a scan could not be recorded")
 
     def _guarded(self, order: Order, task: Callable[[], None]) -> None:
-        """Whatever goes wrong is the scan's verdict, unless it was accepted all the same."""
+        """Run a task; an error becomes the scan's outcome, unless it was accepted anyway."""
         try:
             task()
         except BoothError as error:
@@ -107,8 +107,8 @@ class ScanWriter:
         except OSError as error:
             self._failed(
                 order,
-                f"the spool does not take the scan ({error.strerror or error}); check its disk "
-                "with station status and scan again",
+                f"the scan could not be stored in the spool ({error.strerror or error}); check "
+                "its disk with station status, then scan again",
             )
         except Exception as error:
             self._log.exception("scan %s", order.scan_id)
@@ -118,7 +118,7 @@ class ScanWriter:
         spool = self._spool
         note = spool.notes.read(order.scan_id)
         if (note is not None and note.stage != "armed") or spool.where(order.scan_id):
-            # The same order once more: its verdict stands.
+            # A repeated order: its outcome stands.
             self._events.put(Ended(order.scan_id, True, ""))
             return
         spool.check_space(self._config.spool.min_free_mb)
@@ -129,11 +129,11 @@ class ScanWriter:
         spool.notes.write(note, durable=False)
         if order.late(time.monotonic()):
             raise BoothError(LATE)
-        self._events.put(Begun(order, rig))
+        self._events.put(Started(order, rig))
 
     def _refuse(self, order: Order, reason: str) -> None:
         spool = self._spool
-        note = self._patiently(partial(spool.notes.read, order.scan_id))
+        note = self._retried(partial(spool.notes.read, order.scan_id))
         if note is None or note.stage == "armed":
             self._failed(order, reason)
 
@@ -163,7 +163,7 @@ class ScanWriter:
         self._end(order.scan_id, True, "")
 
     def _refuse_moved_cameras(self, collection: Collection) -> None:
-        """A scan through a wrong calibration is worth nothing: say so while the person is there.
+        """A scan with a wrong calibration is useless: report it while the person is still there.
 
         Raises:
             CalibrationError: naming the cameras that moved.
@@ -180,17 +180,18 @@ class ScanWriter:
         ]
         if moved:
             raise CalibrationError(
-                f"{'; '.join(moved)}; look at it, then run station check, or station calibrate"
+                f"{'; '.join(moved)}; put the camera back and run station check, or run station "
+                "calibrate"
             )
 
     def _failed(self, order: Order, reason: str) -> None:
-        """The scan failed, unless its bundle got into the queue before what went wrong."""
+        """The scan failed, unless its bundle got into the queue before the error."""
         spool = self._spool
-        if self._patiently(partial(spool.where, order.scan_id)) is not None:
+        if self._retried(partial(spool.where, order.scan_id)) is not None:
             self._end(order.scan_id, True, "")
             return
         note = ScanNote(order.scan_id, "failed", label=order.label, reason=reason, boot=boot_id())
-        self._patiently(partial(spool.notes.write, note, durable=False))
+        self._retried(partial(spool.notes.write, note, durable=False))
         self._end(order.scan_id, False, reason)
 
     def _end(self, scan_id: ScanId, accepted: bool, reason: str) -> None:
@@ -198,25 +199,26 @@ class ScanWriter:
         self._events.put(Ended(scan_id, accepted, reason))
 
     def _settle_abandoned(self) -> None:
-        """Give the scans that an earlier sync left behind their verdict: nobody collects them."""
+        """Fail the scans that an earlier sync process left unfinished: nobody collects them."""
         spool = self._spool
-        self._patiently(spool.sweep)
-        for scan_id in self._patiently(spool.notes.ids):
-            note = self._patiently(partial(spool.notes.read, scan_id))
+        self._retried(spool.sweep)
+        for scan_id in self._retried(spool.notes.ids):
+            note = self._retried(partial(spool.notes.read, scan_id))
             if note is None or note.stage not in ("armed", "capturing"):
                 continue
             same_boot = note.boot == boot_id()
             order = Order(scan_id, note.label, note.valid_until_s)
             if note.stage == "armed" and same_boot and not order.late(time.monotonic()):
                 continue
-            if self._patiently(partial(spool.where, scan_id)) is None:
-                # It may have been delivered and taken away between the two looks.
-                again = self._patiently(partial(spool.notes.read, scan_id))
+            if self._retried(partial(spool.where, scan_id)) is None:
+                # It may have been delivered and taken away between the two reads.
+                again = self._retried(partial(spool.notes.read, scan_id))
                 if again is not None and again.stage in ("armed", "capturing"):
                     self._failed(order, _ENDED if note.stage == "capturing" else LATE)
 
-    def _patiently(self, call: Callable[[], T]) -> T:
-        """Ask the disk until it answers: a verdict must not depend on its mood."""
+    def _retried(self, call: Callable[[], T]) -> T:
+        """Retry a disk operation until it succeeds: an outcome must not depend on a passing
+        fault."""
         told = False
         while True:
             try:

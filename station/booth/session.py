@@ -1,12 +1,12 @@
-"""The states of a scan, from the operator's word to the fitting room (pure).
+"""The states of a scan, from the operator's command to the delivered result (pure).
 
     armed -> capturing -> accepted -> reconstructing -> delivered | rescan | failed
       |          |
       +----------+-> failed (the person has to stay or come back)
 
-A scan's state follows from what is on disk: the folder that it lies in, then its note. Nobody
-remembers it, so a process that was killed forgets none. Only the sync process (and, once accepted,
-the worker) may say that a scan failed; until then what is not known is said to be unknown.
+A scan's state follows from what is on disk: the folder that it lies in, then its note. No process
+keeps it in memory, so killing one loses nothing. Only the sync process (and, once accepted, the
+worker) may declare a scan failed; until then an unknown state is reported as unknown.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ State = Literal["armed", "capturing", "accepted", "reconstructing", "delivered",
 FINAL: frozenset[State] = frozenset({"delivered", "rescan", "failed"})
 ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered", "rescan"})
 CANCELLED = "cancelled by the operator"
-"""The reason of a scan that failed because it was given up."""
-UNSURE = "not known yet; do not scan again"
+"""Reason of a scan that failed because it was cancelled."""
+UNSURE = "outcome not known yet; do not scan again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +39,10 @@ class Session:
 
 
 def state_of(note: ScanNote | None, place: str | None) -> State | None:
-    """A scan's state; None if nobody knows the scan.
+    """A scan's state; None if there is no such scan.
 
     Args:
-        note: what is noted of it.
+        note: its note, if there is one.
         place: the spool's folder that it lies in.
     """
     if place == "outbox":
@@ -63,5 +63,5 @@ def state_of(note: ScanNote | None, place: str | None) -> State | None:
 
 
 def overdue(note: ScanNote, now_s: float, boot: str) -> bool:
-    """Whether an order should have been taken up by now; its verdict is still sync's to give."""
+    """Whether an order should have been started by now; only sync decides its outcome."""
     return note.stage == "armed" and (note.boot != boot or now_s > note.valid_until_s)

@@ -1,7 +1,7 @@
-"""`station run`: all processes of a booth in the foreground, started again when they die or hang.
+"""`station run`: all processes of a booth in the foreground, restarted when they die or hang.
 
-The processes tell their progress as they tell systemd's: each has a socket that NOTIFY_SOCKET names
-(sd_notify). One that makes none for its time limit is killed and started again.
+The processes report progress in the same way as to systemd: each has a socket that NOTIFY_SOCKET
+names (sd_notify). A process that reports none within its time limit is killed and restarted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WATCHDOG_S = 10.0
 _STARTING_S = 120.0
 """Compiling the reconstruction for the first time takes most of a minute."""
 _BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0)
-"""The frames of a camera that keeps dying are back within seconds, whatever its history."""
+"""A camera process that keeps dying is restarted within seconds each time."""
 _CALM_S = 10.0
 _STOP_S = 5.0
 
@@ -66,7 +66,7 @@ def services(config: BoothConfig) -> list[Service]:
 
 
 class _Watch:
-    """Hears one process' signs of progress."""
+    """Receives the progress messages of one process."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.path = str(folder / f"notify-{file_name(name)}")
@@ -77,16 +77,16 @@ class _Watch:
         self.begin()
 
     def begin(self) -> None:
-        """A new process is started: what the old one said is forgotten."""
-        self._hear()
+        """Reset for a new process: messages of the old one are ignored."""
+        self._receive()
         self._limit_s, self._last_s = _STARTING_S, time.monotonic()
 
     def silent_for_s(self) -> float:
-        """By how much its time limit has passed; negative while it has not."""
-        self._hear()
+        """Seconds since its time limit; negative before it."""
+        self._receive()
         return time.monotonic() - self._last_s - self._limit_s
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         with contextlib.suppress(OSError):
             while True:
                 for word in self._socket.recv(4096).decode(errors="replace").splitlines():
@@ -120,7 +120,7 @@ class _Child:
         now_s = time.monotonic()
         if self.process is not None and self.process.poll() is None:
             if self.watch.silent_for_s() > 0.0:
-                click.echo(f"{self.service.name} hangs; it is killed", err=True)
+                click.echo(f"{self.service.name} hangs; killing it", err=True)
                 self.process.kill()
                 self.process.wait()
             return
@@ -130,7 +130,7 @@ class _Child:
             self._next_s = now_s + pause_s
             click.echo(
                 f"{self.service.name} ended with code {self.process.returncode}; "
-                f"starting it again in {pause_s:g} s",
+                f"restarting it in {pause_s:g} s",
                 err=True,
             )
             self.process = None
@@ -154,7 +154,8 @@ class _Child:
 
 
 def supervise(table: list[Service], config_path: Path, folder: Path, stop: threading.Event) -> None:
-    """Keep all services running until told to stop; `folder` takes the sockets of their signs."""
+    """Keep all services running until told to stop; `folder` holds the sockets for their progress
+    messages."""
     children = [_Child(service, config_path, folder) for service in table]
     try:
         while not stop.is_set():
@@ -177,7 +178,7 @@ def supervise(table: list[Service], config_path: Path, folder: Path, stop: threa
 @click.command()
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
 def run(config_path: Path | None) -> None:
-    """Run the whole booth in the foreground until Ctrl-C; on a station systemd does this.
+    """Run the whole booth in the foreground until Ctrl-C; an installed booth uses systemd instead.
 
     \b
     Examples:
@@ -186,13 +187,18 @@ def run(config_path: Path | None) -> None:
     path = find_config(config_path)
     config = load_config(path)
     folder = private_folder(config.runtime.folder)
-    busy = BoothError(f"a station runs already in {folder}; end it first (Ctrl-C in its terminal)")
+    busy = BoothError(
+        f"a station is already running in {folder}; end it first (Ctrl-C in its terminal)"
+    )
     with held(folder / STATION_LOCK, busy):
-        click.echo(f"the booth of {path} runs until Ctrl-C; next, elsewhere: station start")
+        click.echo(
+            f"the booth of {path} is running; Ctrl-C ends it; next, in another terminal: "
+            "station start"
+        )
         if not config.calibration.exists():
             click.echo(
-                f"{config.calibration} is missing: station calibrate comes before the first scan"
+                f"{config.calibration} is missing: run station calibrate before the first scan"
             )
-        # Sockets lie where their path is short enough for the kernel.
+        # Sockets are in a folder whose path is short enough for the kernel.
         sockets = Path(endpoint(folder, "notify").removeprefix("ipc://")).parent
         supervise(services(config), path.resolve(), sockets, stop_event())

@@ -1,4 +1,4 @@
-"""The sync-and-merge process: framesets by hardware time, the live cloud, and scans' verdicts."""
+"""The sync-and-merge process: framesets by hardware time, the live cloud, and outcomes of scans."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import click
 import zmq
 
 from station.booth.collection import LATE, Collection, Order
+from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import LiveCloud
-from station.booth.scan_writer import Begun, Ended, ScanWriter
-from station.booth.sensor_truth import CameraTruth, wrong_sensors
+from station.booth.scan_writer import Ended, ScanWriter, Started
 from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
@@ -34,7 +34,7 @@ _ENDED_KEPT = 100
 
 
 class SyncProcess:
-    """Connects the parts: frames to framesets, framesets to scans, orders to verdicts."""
+    """Connects the parts: frames to framesets, framesets to scans, orders to outcomes."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
@@ -47,13 +47,13 @@ class SyncProcess:
         self._matcher: FramesetMatcher[LiveFrame] = FramesetMatcher(
             self._names, config.sync.tolerance_s
         )
-        self._truth = {name: CameraTruth() for name in self._names}
+        self._checks = {name: FrameCheck() for name in self._names}
         self._serials: dict[str, str] = {}
         self._live = LiveCloud(config.calibration, config.sync.live_hz)
         drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration), log)
         self._writer = ScanWriter(config, drift, log)
         self._order: Order | None = None
-        """Taken up; its scan is not collected yet."""
+        """Started, but its frames are not being collected yet."""
         self._collection: Collection | None = None
         self._writing: dict[ScanId, Order] = {}
         self._cancelled: set[ScanId] = set()
@@ -63,7 +63,7 @@ class SyncProcess:
         self._heart = Heartbeat(folder, "sync")
 
     def run(self, stop: threading.Event) -> None:
-        """Until told to stop."""
+        """Run until told to stop."""
         poller = zmq.Poller()
         poller.register(self._intake.socket, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
@@ -75,11 +75,11 @@ class SyncProcess:
             if self._commands in ready:
                 self._answer()
             for event in self._writer.events():
-                self._hear(event)
+                self._handle(event)
             self._watch_collection()
             self._heart.beat()
             if self._heart.due:
-                self._heart.tell(self._health())
+                self._heart.report(self._health())
         self._writer.close()
         self._context.destroy(linger=0)
 
@@ -87,7 +87,7 @@ class SyncProcess:
         for frame in self._intake.frames():
             header = frame.header
             self._serials[header.camera] = header.serial
-            if not self._truth[header.camera].usable(header, frame.depth):
+            if not self._checks[header.camera].usable(header, frame.depth):
                 continue
             for found in self._matcher.push(header.camera, header.host_time_s, frame):
                 self._use(found)
@@ -109,7 +109,7 @@ class SyncProcess:
         if points is not None:
             self._events.send_multipart([b"cloud", points.tobytes()])
 
-    def _hear(self, event: Begun | Ended) -> None:
+    def _handle(self, event: Started | Ended) -> None:
         if isinstance(event, Ended):
             self._ended.append(event)
             told = ScanEvent(
@@ -161,7 +161,7 @@ class SyncProcess:
         return [
             f"camera {name}: {trouble}"
             for name in self._names
-            if (trouble := self._truth[name].trouble(now_s))
+            if (trouble := self._checks[name].trouble(now_s))
         ]
 
     def _answer(self) -> None:
@@ -179,10 +179,10 @@ class SyncProcess:
             return Reply(ok=True)
         if request.command == "cancel":
             return self._cancel(scan_id_of(request.scan_id))
-        return Reply(ok=False, error=f"sync knows no command {request.command!a:.80}")
+        return Reply(ok=False, error=f"sync does not know the command {request.command!a:.80}")
 
     def _take_up(self, order: Order) -> None:
-        """Begin a scan, or refuse it with the reason; the verdict is on disk either way."""
+        """Start a scan, or refuse it with the reason; the outcome is on disk either way."""
         if order.scan_id in self._in_hand():
             return
         if order.late(time.monotonic()):
@@ -202,20 +202,20 @@ class SyncProcess:
         return found
 
     def _unready(self) -> str:
-        """Why no scan can be taken now, or nothing."""
+        """Reason why no scan can be taken now; empty if one can."""
         if self._order is not None or self._collection is not None:
             current = self._order or (self._collection and self._collection.order)
             return f"scan {current and current.scan_id} is being taken; wait until it is done"
         if silent := self._silent():
             return "; ".join(
-                f"camera {name} gives no frames{self._intake.why(name)}; "
+                f"camera {name} sends no frames{self._intake.why(name)}; "
                 "check its cable, see station status"
                 for name in silent
             )
         return "; ".join(self._troubles())
 
     def _cancel(self, scan_id: ScanId) -> Reply:
-        """Collect a scan no further; what was collected is dropped."""
+        """Stop collecting a scan and discard what was collected."""
         if self._order is not None and self._order.scan_id == scan_id:
             self._cancelled.add(scan_id)
             return Reply(ok=True)
@@ -247,8 +247,8 @@ class SyncProcess:
                     "clock_resets": health.clock_resets,
                     "silent": name in silent,
                     "last_frame_age_s": now_s - self._intake.last_frame_s.get(name, now_s),
-                    "rate_hz": self._truth[name].rate_hz(),
-                    "trouble": self._truth[name].trouble(now_s),
+                    "rate_hz": self._checks[name].rate_hz(),
+                    "trouble": self._checks[name].trouble(now_s),
                 }
                 for name in self._names
                 if (health := self._intake.health.get(name))

@@ -1,3 +1,3 @@
-"""The console: the operator's page and the API, over the same endpoint that the commands use.
-Who may do what is in `security`, what changes by the second in `live`, requests in `api`.
+"""The console: the operator's page and the API, using the same endpoint as the commands.
+Permissions are in `security`, live data in `live`, requests in `api`.
 """

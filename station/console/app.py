@@ -24,12 +24,12 @@ from station.console.security.origin import own_names
 
 PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
-_SIGN_PERIOD_S = 0.2
-"""Shorter than the period of health, so that none is left out."""
+_REPORT_PERIOD_S = 0.2
+"""Shorter than the period of health reports, so that none is left out."""
 
 
 class _Static(StaticFiles):
-    """Files of the page: a browser keeps them and asks each time whether they are still good."""
+    """Files of the page: a browser caches them and revalidates them each time."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
@@ -44,9 +44,9 @@ def create_app(console: Console) -> FastAPI:
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         console.events.attach(asyncio.get_running_loop())
         console.start()
-        signs = asyncio.create_task(_give_signs(console))
+        progress = asyncio.create_task(_report_progress(console))
         yield
-        signs.cancel()
+        progress.cancel()
         await asyncio.to_thread(console.close)
 
     app = FastAPI(
@@ -67,15 +67,15 @@ def create_app(console: Console) -> FastAPI:
     return app
 
 
-async def _give_signs(console: Console) -> None:
-    """Signs of progress: requests are served (this runs among them) and the booth is watched."""
+async def _report_progress(console: Console) -> None:
+    """Report progress while requests are served (in the same loop) and the booth is watched."""
     console.heart.ready()
     while True:
         if not console.watch.hangs():
             console.heart.beat()
         if console.heart.due:
-            console.heart.tell(console.watch.health())
-        await asyncio.sleep(_SIGN_PERIOD_S)
+            console.heart.report(console.watch.health())
+        await asyncio.sleep(_REPORT_PERIOD_S)
 
 
 def _serve_pages(app: FastAPI) -> None:

@@ -1,4 +1,4 @@
-"""`station console`, and `station token`: who may use it."""
+"""`station console`, and `station token` for access to its API."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ config_option = click.option(
 def console(config_path: Path | None, set_password: bool, make_certificate: bool) -> None:
     """Serve the operator's page and the API; `station run` starts it.
 
-    Alone on this machine it needs neither password nor certificate. Beyond it (console.host) both.
+    If only this machine can reach it, it needs neither a password nor a certificate; if others can
+    (console.host), it needs both.
 
     \b
     Examples:
@@ -52,7 +53,7 @@ def _prepare(config: BoothConfig, set_password: bool, certificate: bool) -> None
     if set_password:
         text = click.prompt("password", hide_input=True, confirmation_prompt=True)
         Vault(folder).set_password(text)
-        click.echo("the password is set; whoever was logged in has to log in again")
+        click.echo("the password is set; everyone who was logged in has to log in again")
     if certificate:
         path = make_certificate(folder, [*config.console.names, config.console.host])
         click.echo(f"{path}: browsers will ask once whether to trust it")
@@ -74,9 +75,11 @@ def token() -> None:
 @click.argument("name")
 @click.option(
     "--scope", "scopes", type=click.Choice(SCOPES), multiple=True, default=("read",),
-    show_default=True, help="read: see; scan: take scans; manage: delete, calibrate",
+    show_default=True, help="read: see scans; scan: take scans; manage: delete, calibrate",
 )  # fmt: skip
-@click.option("--days", type=click.FloatRange(min=0.0), help="worthless after so many days")
+@click.option(
+    "--days", type=click.FloatRange(min=0.0), help="the token expires after this many days"
+)
 @config_option
 def make(
     name: str, scopes: tuple[Scope, ...], days: float | None, config_path: Path | None
@@ -89,13 +92,13 @@ def make(
     """
     secret = _vault(config_path).make_token(name, scopes, days)
     click.echo(secret)
-    click.echo("keep it: it is not shown again; the station knows its hash alone", err=True)
+    click.echo("store it now: it is not shown again; the station keeps only its hash", err=True)
 
 
 @token.command("list")
 @config_option
 def list_tokens(config_path: Path | None) -> None:
-    """List the tokens: name, scopes, until when.
+    """List the tokens: name, scopes, expiry date.
 
     \b
     Examples:
@@ -105,7 +108,7 @@ def list_tokens(config_path: Path | None) -> None:
     if not tokens:
         click.echo("no tokens; station token make NAME makes one")
     for found in tokens:
-        until = "for ever" if found.expires is None else f"until {_day(found.expires)}"
+        until = "does not expire" if found.expires is None else f"until {_day(found.expires)}"
         click.echo(f"{found.name:<20} {', '.join(found.scopes):<22} {until}")
 
 
@@ -113,14 +116,14 @@ def list_tokens(config_path: Path | None) -> None:
 @click.argument("name")
 @config_option
 def revoke(name: str, config_path: Path | None) -> None:
-    """Make a token worthless, at once.
+    """Revoke a token, with immediate effect.
 
     \b
     Examples:
       station token revoke orders
     """
     _vault(config_path).revoke_token(name)
-    click.echo(f"token {name} is worthless now")
+    click.echo(f"token {name} is revoked")
 
 
 def _vault(config_path: Path | None) -> Vault:

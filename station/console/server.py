@@ -19,9 +19,9 @@ from station.core.config import ConsoleConfig
 from station.core.errors import BoothError, ConfigError
 
 _HEAD_S = 10.0
-"""A request's head has to arrive within this; nobody holds a connection open by typing slowly."""
+"""A request's head has to arrive within this; a slow sender cannot hold a connection open."""
 _HEAD_BYTES = 16 << 10
-_MOST_CONNECTIONS = 200
+_MAX_CONNECTIONS = 200
 _STOP_S = 2
 
 
@@ -66,8 +66,7 @@ class PatientProtocol(H11Protocol):
 def check_exposure(config: ConsoleConfig, has_password: bool) -> bool:
     """Whether to speak TLS.
 
-    Raises:
-        ConfigError: beyond this machine without a password or a certificate.
+    Raises: ConfigError: other machines can connect, and there is no password or certificate.
     """
     certificate = config.folder / CERTIFICATE
     if is_loopback(config.host):
@@ -112,7 +111,7 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
             ws_max_size=1 << 10,
             ws_max_queue=2,
             h11_max_incomplete_event_size=_HEAD_BYTES,
-            limit_concurrency=_MOST_CONNECTIONS,
+            limit_concurrency=_MAX_CONNECTIONS,
             timeout_keep_alive=30,
             timeout_graceful_shutdown=_STOP_S,
             ssl_certfile=str(config.folder / CERTIFICATE) if secure else None,

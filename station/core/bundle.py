@@ -26,13 +26,13 @@ CALIBRATION = "calibration.json"
 _PNG_FAST = [
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
 ]  # fmt: skip
-"""A sensor knows few different depths: whole readings repeat, differences of neighbours do not. So
+"""A sensor has few distinct depths: whole readings repeat, differences of neighbours do not. So
 files are smaller unfiltered, and quicker to write and to read."""
 _ENCODERS = 2
 _PNG_SLACK_BYTES = 1 << 16
-"""Beyond twice the pixels' own size, which no PNG of noise reaches."""
-MOST_CAMERAS, MOST_FRAMES = 64, 1000
-_MOST_COUNT = 1 << 63
+"""Allowance beyond twice the pixels' own size, which not even a PNG of noise reaches."""
+MAX_CAMERAS, MAX_FRAMES = 64, 1000
+_MAX_COUNT = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Bundle:
         """
         path = self.folder / record.file
         if any(parent.is_symlink() for parent in path.parents if parent != self.folder.parent):
-            raise BundleError(f"{path} lies behind a link; scan again")
+            raise BundleError(f"{path} is reached through a symbolic link; scan again")
         calibration = self.rig.cameras[camera]
         expected = (calibration.height, calibration.width)
         most_bytes = 2 * 2 * calibration.height * calibration.width + _PNG_SLACK_BYTES
@@ -82,7 +82,7 @@ class Bundle:
             raise BundleError(f"{path} cannot be read ({cause.strerror}); scan again") from None
         except ValueError as cause:
             raise BundleError(f"{path} {cause}; scan again") from None
-        # Looked at before decoding: a small file may claim to be an image of gigabytes.
+        # Checked before decoding: a small file may claim to be an image of gigabytes.
         found = _png_size(data)
         if found is None:
             raise BundleError(f"{path} is torn or not a PNG; scan again")
@@ -103,9 +103,9 @@ class Bundle:
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Height and width that a PNG's first chunk tells; None if it is torn or none.
+    """Height and width from a PNG's first chunk; None if it is torn or not a PNG.
 
-    OpenCV decodes a torn PNG to black rows in silence, so its last chunk is asked for, too.
+    OpenCV silently decodes a torn PNG to black rows, so its last chunk is checked, too.
     """
     if not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
         return None
@@ -149,14 +149,16 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(f"{path}: the field {missing} is missing; scan again") from None
     except (TypeError, ValueError, AttributeError, OverflowError) as cause:
         raise BundleError(f"{path}: {cause}; scan again") from None
-    if len(frames) > MOST_CAMERAS or any(len(f) > MOST_FRAMES for f in frames.values()):
+    if len(frames) > MAX_CAMERAS or any(len(f) > MAX_FRAMES for f in frames.values()):
         raise BundleError(
-            f"{path}: at most {MOST_CAMERAS} cameras with {MOST_FRAMES} frames each are read"
+            f"{path}: a bundle may have at most {MAX_CAMERAS} cameras with {MAX_FRAMES} frames each"
         )
     if not (math.isfinite(bundle.spread_s_max) and bundle.spread_s_max >= 0.0):
         raise BundleError(f"{path}: spread_s_max is {bundle.spread_s_max}; scan again")
     if not (np.isfinite(scale) and 0.0 < scale < 0.1):
-        raise BundleError(f"{path}: depth_scale_m is {scale}; metres per unit were expected")
+        raise BundleError(
+            f"{path}: depth_scale_m is {scale}; a positive number of metres per unit was expected"
+        )
     if not any(frames.values()):
         raise BundleError(f"{path}: no camera has a frame; scan again")
     for camera in frames:
@@ -164,7 +166,7 @@ def read_bundle(folder: Path) -> Bundle:
             known = ", ".join(rig.cameras)
             raise CalibrationError(
                 f"{path}: camera {camera} is not in calibration.json (it has: {known}); "
-                "calibrate the booth anew"
+                "calibrate the booth again"
             )
     return bundle
 
@@ -175,7 +177,9 @@ def _record(entry: Mapping[str, Any]) -> FrameRecord:
     if name.is_absolute() or ".." in name.parts:
         raise ValueError(f"the frame file {file!a:.80} lies outside the bundle")
     if not file.isprintable():
-        raise ValueError(f"the frame file {file!a:.80} has letters that no file's name has")
+        raise ValueError(
+            f"the frame file {file!a:.80} has characters that are not allowed in a file name"
+        )
     record = FrameRecord(
         file=file,
         device_ticks=int(entry["device_ticks"]),
@@ -187,7 +191,7 @@ def _record(entry: Mapping[str, Any]) -> FrameRecord:
         raise ValueError(f"{file}: tick_hz is {record.tick_hz}")
     if not math.isfinite(record.host_time_s):
         raise ValueError(f"{file}: host_time_s is {record.host_time_s}")
-    if not all(0 <= count < _MOST_COUNT for count in (record.device_ticks, record.sequence)):
+    if not all(0 <= count < _MAX_COUNT for count in (record.device_ticks, record.sequence)):
         raise ValueError(f"{file}: device_ticks or sequence is negative or too large")
     return record
 
@@ -215,7 +219,7 @@ def write_bundle(
     spread_s_max: float,
     booth: str = "",
 ) -> None:
-    """Write a bundle's files into a new folder; publishing it under its final name is the caller's.
+    """Write a bundle's files into a new folder; the caller publishes it under its final name.
 
     Args:
         frames: per camera, in order of time.
@@ -262,6 +266,6 @@ def _write_frames(folder: Path, camera: str, taken: Sequence[CapturedFrame]) -> 
         )
         return asdict(record)
 
-    # Encoding leaves the interpreter free: the person waits for it.
+    # Encoding releases the interpreter lock; it runs in threads because the person waits for it.
     with ThreadPoolExecutor(max_workers=_ENCODERS) as pool:
         return {"frames": list(pool.map(write, range(len(taken))))}

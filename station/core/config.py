@@ -26,8 +26,8 @@ _SMALLEST_BALL_M = 0.07
 def _found_afar(radius_m: float) -> float:
     if radius_m < _SMALLEST_BALL_M:
         raise ValueError(
-            f"a ball of less than {_SMALLEST_BALL_M:g} m in radius is lost from 2.4 m on, so that "
-            "front and back cameras hardly see it together: use a larger one"
+            f"a ball of less than {_SMALLEST_BALL_M:g} m in radius is not found reliably beyond "
+            "2.4 m, so front and back cameras rarely see it together: use a larger one"
         )
     return radius_m
 
@@ -56,7 +56,10 @@ class SyncConfig(Strict):
 
     tolerance_s: float = Field(default=0.025, gt=0.0, le=0.5, description="a set's widest spread")
     silent_after_s: float = Field(
-        default=1.0, gt=0.0, le=60.0, description="a camera without frames this long is named"
+        default=1.0,
+        gt=0.0,
+        le=60.0,
+        description="a camera that sends no frames for this long is reported",
     )
     live_hz: float = Field(default=3.0, gt=0.0, le=30.0, description="rate of the live cloud")
 
@@ -66,7 +69,7 @@ class ScanConfig(Strict):
 
     framesets: int = Field(default=10, ge=1, le=100)
     max_duration_s: float = Field(
-        default=3.0, gt=0.0, le=30.0, description="all framesets within this time, or it fails"
+        default=3.0, gt=0.0, le=30.0, description="a scan fails if its framesets take longer"
     )
 
 
@@ -75,7 +78,9 @@ class CalibrateConfig(Strict):
 
     folder: ConfigPath = Field(default=Path("calibrations"), description="all dated calibrations")
     ball_radius_m: Annotated[float, AfterValidator(_found_afar)] = Field(default=0.1, le=0.3)
-    reference: str = Field(default="", description="the camera that the others are tied to first")
+    reference: str = Field(
+        default="", description="the camera whose frame the others are solved in first"
+    )
     front: tuple[str, ...] = Field(
         default=(), description="the cameras that face the person; default: named front..."
     )
@@ -107,8 +112,12 @@ class WorkersConfig(Strict):
 
     count: int = Field(default=1, ge=0, le=64)
     method: Literal["joint", "paper"] = "joint"
-    timeout_s: float = Field(default=120.0, gt=0.0, le=3600.0, description="a job hangs after this")
-    retries: int = Field(default=2, ge=0, le=10, description="tries after the first failure")
+    timeout_s: float = Field(
+        default=120.0, gt=0.0, le=3600.0, description="a job that takes longer is stopped"
+    )
+    retries: int = Field(
+        default=2, ge=0, le=10, description="further attempts after the first failure"
+    )
 
 
 class RetentionConfig(Strict):
@@ -125,14 +134,20 @@ class ConsoleConfig(Strict):
     host: str = Field(default="127.0.0.1", description="address to listen at; 0.0.0.0 for all")
     port: int = Field(default=8420, ge=1, le=65535)
     names: tuple[str, ...] = Field(
-        default=(), description="names under which browsers reach it, beside the host's own"
+        default=(), description="names by which browsers reach it, besides the host's own"
     )
     folder: ConfigPath = Field(default=Path("console"), description="password, tokens, log")
     language: Literal["en", "zh"] = "en"
     unit: Literal["cm", "in"] = "cm"
-    countdown_s: int = Field(default=3, ge=0, le=30, description="before a scan, for the person")
-    preview_hz: float = Field(default=8.0, gt=0.0, le=10.0, description="of the depth pictures")
-    session_hours: float = Field(default=12.0, gt=0.0, le=720.0, description="then: log in again")
+    countdown_s: int = Field(
+        default=3, ge=0, le=30, description="countdown before a scan, for the person"
+    )
+    preview_hz: float = Field(
+        default=8.0, gt=0.0, le=10.0, description="rate of the depth pictures"
+    )
+    session_hours: float = Field(
+        default=12.0, gt=0.0, le=720.0, description="how long a login stays valid"
+    )
     recordings: ConfigPath | None = Field(
         default=None, description="calibrate from DIR/<step>/<camera> (training, demonstrations)"
     )
@@ -148,16 +163,18 @@ class DeliverConfig(Strict):
         default=None, description="holds the key that signs what is posted (HMAC-SHA256)"
     )
     link: str = Field(default="", description="where that program reaches the console: https://...")
-    rescans: bool = Field(default=False, description="also results that should be scanned again")
+    rescans: bool = Field(default=False, description="also results whose verdict is rescan")
 
     @model_validator(mode="after")
     def _has_one_target(self) -> Self:
         if (self.folder is None) == (self.url is None):
             raise ValueError(f"deliver {self.name}: give either folder or url")
         if self.url is not None and not self.url.startswith(("http://", "https://")):
-            raise ValueError(f"deliver {self.name}: the url begins with https:// or http://")
+            raise ValueError(f"deliver {self.name}: the url must begin with https:// or http://")
         if self.url is not None and self.secret_file is None:
-            raise ValueError(f"deliver {self.name}: a url needs secret_file, to sign posts")
+            raise ValueError(
+                f"deliver {self.name}: a url needs secret_file, the key that signs what is posted"
+            )
         return self
 
 
@@ -213,7 +230,7 @@ class BoothConfig(Strict):
         named = (*self.calibrate.front, *filter(None, [self.calibrate.reference]))
         for name in named:
             if name not in names:
-                raise ValueError(f"calibrate names {name}, which is not a camera here")
+                raise ValueError(f"calibrate names {name}, which is not a camera of this booth")
         return self
 
     @property

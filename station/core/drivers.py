@@ -59,8 +59,8 @@ class CameraConfig(Strict):
         """
         del recording
         raise ConfigError(
-            f"camera {self.name}: the driver {self.driver} plays no recordings; "
-            "use a configuration whose cameras are read by one that does"
+            f"camera {self.name}: the driver {self.driver} cannot play recordings; use a "
+            "configuration whose cameras have a driver that can"
         )
 
 
@@ -74,19 +74,19 @@ def driver_class(name: str) -> Any:
     if not found:
         known = ", ".join(sorted({point.name for point in entry_points(group=ENTRY_POINTS)}))
         raise ConfigError(
-            f"there is no driver {name!r}; installed: {known or 'none, install body-booth again'}"
+            f"there is no driver {name!r}; installed: {known or 'none; reinstall body-booth'}"
         )
     try:
         return found[0].load()
     except (ImportError, AttributeError) as cause:
         raise ConfigError(
             f"the driver {name} ({found[0].value}) cannot be loaded ({cause}); "
-            "install its package again"
+            "reinstall its package"
         ) from None
 
 
 class AnyCamera(CameraConfig):
-    """A section of which only the common keys are looked at."""
+    """A section of which only the common keys are checked."""
 
     model_config = ConfigDict(extra="ignore")
 

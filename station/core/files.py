@@ -17,9 +17,9 @@ from typing import Any
 from station.core.errors import BoothError, FormatError
 
 PRIVATE_FOLDER_MODE = 0o700
-"""Body scans are personal data: nobody but the service's user reads them."""
+"""Body scans are personal data: only the service's user may read them."""
 _LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
-MOST_JSON_BYTES = 16 << 20
+MAX_JSON_BYTES = 16 << 20
 """A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
 
 
@@ -49,10 +49,10 @@ def private_folder(folder: Path) -> Path:
 
 @contextmanager
 def held(path: Path, busy: BoothError) -> Iterator[None]:
-    """Hold a lock file alone; leaving the block frees it, and so does the end of the process.
+    """Hold a lock file exclusively; it is released when the block or the process ends.
 
     Raises:
-        BoothError: `busy`, where another process holds it.
+        BoothError: `busy`, if another process holds it.
     """
     private_folder(path.parent)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -91,8 +91,8 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no regular file, or larger than ``most_bytes``.
-        OSError: the disk does not give it.
+        ValueError: it is not a regular file, or larger than ``most_bytes``.
+        OSError: the disk cannot be read.
     """
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -106,16 +106,16 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
         if not stat.S_ISREG(status.st_mode):
             raise ValueError("is not a regular file")
         if status.st_size > most_bytes:
-            raise ValueError(f"has {status.st_size} bytes, at most {most_bytes} are read")
+            raise ValueError(f"has {status.st_size} bytes, at most {most_bytes} are allowed")
         return stream.read(most_bytes + 1)
 
 
-def read_small(path: Path, most_bytes: int) -> Any:
+def read_bounded_json(path: Path, most_bytes: int) -> Any:
     """A JSON document of bounded size.
 
     Raises:
         FileNotFoundError, OSError: as read_regular.
-        ValueError: it is no regular file, too large, or no JSON (nested too deeply, too).
+        ValueError: it is not a regular file, too large, or not JSON (or nested too deeply).
     """
     try:
         return json.loads(read_regular(path, most_bytes))
@@ -163,7 +163,7 @@ def read_json(
             what was found.
     """
     try:
-        document = read_small(path, MOST_JSON_BYTES)
+        document = read_bounded_json(path, MAX_JSON_BYTES)
     except FileNotFoundError:
         raise error(f"{path} is missing; a {format} file was expected there") from None
     except (OSError, ValueError) as cause:

@@ -1,13 +1,13 @@
-"""The facts of a Kinect v1, each in one place: image, clock, raw readings, errors.
+"""Parameters of the Kinect v1: image, clock, raw readings, errors.
 
 Raw 11-bit disparities become depth by 0.1236 tan(raw / 2842.5 + 1.1863) metres for every unit, an
 approximation in wide use among libfreenect's users; each unit's deviation from it is smooth in
-depth and taken out by the calibration's depth correction.
+depth and removed by the calibration's depth correction.
 
 Errors are given in inverse depth, where they are the same at every range: the random error of depth
 is 1.425e-3 z^2 m (Khoshelham & Elberink 2012), so 1.425e-3 1/m of inverse depth, growing as a
 surface is seen at a slant; readings are 1/8 px of disparity apart; errors are correlated over the
-matching window. (The simulation has numbers of its own: it must not share what is assumed here.)
+matching window. (The simulation has numbers of its own: it must not share these assumptions.)
 """
 
 from __future__ import annotations
@@ -44,18 +44,19 @@ ROUNDING = STEP**2 / 12.0
 INDEPENDENT_HZ = 20.0
 """Frames a second of what is waved at 0.4 m/s whose errors are nearly independent: at 1.7 m it
 moves by 7 px in a twentieth of a second, over which the correlation of errors falls to a hundredth;
-neighbours among 30 a second share an eighth. More of them would seem to say more than they do."""
+neighbours among 30 a second share an eighth. Using more frames would overstate their
+information."""
 
 
 def nominal_intrinsics() -> NDArray[np.float64]:
-    """K of the depth image (3x3, pixels) as the maker states it."""
+    """K of the depth image (3x3, pixels) as the manufacturer states it."""
     return np.array(
         [[FOCAL_PX, 0.0, (WIDTH - 1) / 2], [0.0, FOCAL_PX, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]]
     )
 
 
 def depth_m_of_raw(raw: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Metres of raw values; 0 for no reading and for what lies beyond any use."""
+    """Metres of raw values; 0 for no reading and beyond the useful range."""
     depth = 0.1236 * np.tan(np.asarray(raw, np.float64) / 2842.5 + 1.1863)
     usable = (np.asarray(raw) < NO_READING) & (depth > 0.0) & (depth < _FARTHEST_M)
     return np.where(usable, depth, 0.0)

@@ -13,10 +13,11 @@ from station.core.errors import BoothError
 from station.core.service import set_up_caches
 
 _OPTIONAL = {
-    "open3d": "this needs open3d, which a booth does without; apt install body-booth-simulation, "
+    "open3d": "this command needs open3d, which is not part of the basic installation: apt "
+    "install body-booth-simulation, "
     "or pip install 'body-booth[simulation]'",
 }
-"""A library that may be missing -> what to do then."""
+"""A library that may be missing -> the remedy."""
 
 
 class LazyGroup(click.Group):

@@ -18,7 +18,7 @@ from station.core.files import read_json, write_json
 
 FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
-MOST_PIXELS = 4096
+MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
 _ROTATION_TOLERANCE = 1e-4
 
@@ -53,7 +53,7 @@ class DepthCorrection:
             gx, gy = self.image_gradient
             corrected = corrected + gx * np.linspace(-1.0, 1.0, width, dtype=np.float32)
             corrected += gy * np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
-        # A correction without sense at a depth it was not made for must not give points behind.
+        # A correction extrapolated beyond its depths must not give points behind the camera.
         usable = seen & (corrected > 0)
         return np.where(usable, 1.0 / np.where(usable, corrected, 1.0), 0.0).astype(depth_m.dtype)
 
@@ -120,7 +120,7 @@ class Rig:
         except KeyError:
             known = ", ".join(self.cameras) or "none"
             raise CalibrationError(
-                f"camera {name} is not in {source} (it has: {known}); calibrate the booth anew"
+                f"camera {name} is not in {source} (it has: {known}); calibrate the booth again"
             ) from None
 
     def to_json(self) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class Rig:
             FormatError: naming the file, the camera and the field that cannot be used.
         """
         if not path.exists():
-            raise FormatError(f"{path} is missing; a booth makes it with: station calibrate")
+            raise FormatError(f"{path} is missing; make it with: station calibrate")
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         try:
             cameras = {
@@ -159,11 +159,11 @@ class Rig:
                 residual_rms_m=float(document["residual_rms_m"]),
             )
         except KeyError as missing:
-            raise FormatError(f"{path}: the field {missing} is missing; calibrate anew") from None
+            raise FormatError(f"{path}: the field {missing} is missing; calibrate again") from None
         except (ValueError, TypeError, AttributeError, OverflowError) as cause:
-            raise FormatError(f"{path}: {cause}; calibrate anew") from None
+            raise FormatError(f"{path}: {cause}; calibrate again") from None
         if not rig.cameras:
-            raise FormatError(f"{path}: there is no camera in it; calibrate anew")
+            raise FormatError(f"{path}: it contains no camera; calibrate again")
         return rig
 
 
@@ -186,8 +186,8 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"camera {name}: K must have positive focal lengths")
     width, height = int(fields["width"]), int(fields["height"])
-    if not (0 < width <= MOST_PIXELS and 0 < height <= MOST_PIXELS):
-        raise ValueError(f"camera {name}: width and height must lie between 1 and {MOST_PIXELS}")
+    if not (0 < width <= MAX_PIXELS and 0 < height <= MAX_PIXELS):
+        raise ValueError(f"camera {name}: width and height must lie between 1 and {MAX_PIXELS}")
     return CameraCalibration(
         name=name,
         serial=str(fields["serial"]),

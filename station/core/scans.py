@@ -1,7 +1,7 @@
-"""Scan ids, and what is noted of each scan outside its bundle and its result.
+"""Scan ids, and the note that is kept of each scan outside its bundle and result.
 
-A note (`spool/scans/<scan id>.json`) says what was ordered and what became of it. It is written
-before the step that it tells of, by one process at a time:
+A note (`spool/scans/<scan id>.json`) records the order and its outcome. It is written before the
+step that it describes, by one process at a time:
 
     control   armed       the operator's order
     sync      capturing   the order was taken up
@@ -10,7 +10,7 @@ before the step that it tells of, by one process at a time:
     worker    delivered   it has it: from here on the result may be moved away
     worker    failed      no reconstruction
 
-Where a scan's bundle and result lie (`station.core.spool`) counts for more than its note. A note
+Where a scan's bundle and result lie (`station.core.spool`) takes precedence over its note. A note
 stays until the retention period ends, so that no scan is delivered twice.
 """
 
@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Any, Literal, NewType, get_args
 
 from station.core.errors import InputError
-from station.core.files import private_folder, read_small, write_json
+from station.core.files import private_folder, read_bounded_json, write_json
 
 ScanId = NewType("ScanId", str)
 """A scan's id: 1 to 64 letters, digits, '-' and '_'. It names folders, so nothing else may."""
 _SCAN_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_MOST_NOTE_BYTES = 1 << 16
+_MAX_NOTE_BYTES = 1 << 16
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 Stage = Literal["armed", "capturing", "accepted", "delivering", "delivered", "failed"]
@@ -39,12 +39,12 @@ def scan_id_of(text: object) -> ScanId:
     """The scan id that a message, a command line or a folder's name gives.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a valid one.
     """
     if not isinstance(text, str) or _SCAN_ID.fullmatch(text) is None:
         raise InputError(
-            f"{text!a:.80} is no scan id: use 1 to 64 letters, digits, '-' and '_', "
-            "or leave it out for a new one"
+            f"{text!a:.80} is not a valid scan id: use 1 to 64 letters, digits, '-' and '_', or "
+            "leave it out to get a new one"
         )
     return ScanId(text)
 
@@ -55,7 +55,7 @@ def is_scan_id(text: str) -> bool:
 
 
 def new_scan_id() -> ScanId:
-    """An id that tells when the scan was ordered (UTC)."""
+    """An id that contains the time of the order (UTC)."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     return ScanId(f"{stamp}-{secrets.token_hex(2)}")
 
@@ -74,7 +74,7 @@ class ScanNote:
     label: str = ""
     reason: str = ""
     valid_until_s: float = 0.0
-    """Until when the order may be taken up: host's monotonic clock of this boot."""
+    """Deadline for starting the order: host's monotonic clock of this boot."""
     boot: str = ""
     """The boot that the note was written in."""
     result: str = ""
@@ -82,7 +82,7 @@ class ScanNote:
     verdict: str = ""
     """Verdict of the result: "ok" or "rescan"."""
     tries: int = 0
-    """Reconstructions that ended badly by themselves."""
+    """Number of reconstructions that failed on their own."""
     deaths: int = 0
     """Number of workers' processes that ended meanwhile; most likely no fault of the scan."""
 
@@ -100,10 +100,10 @@ class Notes:
         """The note of a scan; None if there is none or it is damaged.
 
         Raises:
-            OSError: the disk does not give it.
+            OSError: the disk cannot be read.
         """
         try:
-            return _note(read_small(self.path(scan_id), _MOST_NOTE_BYTES), scan_id)
+            return _note(read_bounded_json(self.path(scan_id), _MAX_NOTE_BYTES), scan_id)
         except (FileNotFoundError, ValueError, TypeError):
             return None
 
@@ -114,7 +114,7 @@ class Notes:
             durable: it must survive a loss of power, not only the end of a process.
 
         Raises:
-            OSError: the disk does not take it.
+            OSError: the disk cannot be written.
         """
         write_json(self.path(note.scan_id), asdict(note), durable=durable)
 

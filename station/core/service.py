@@ -1,8 +1,8 @@
-"""The life of every process: signals, logs, caches, readiness, progress, death with its parent.
+"""Life cycle of every process: signals, logs, caches, readiness, progress, end with its parent.
 
-A process tells its supervisor (systemd, or `station run`, by the same protocol) when it is ready,
-and from then on that it makes progress: `Heartbeat.beat` is called where work is done, not by a
-timer, so that a process that hangs is replaced. Beside that it writes what it knows of itself to
+A process reports to its supervisor (systemd, or `station run`, by the same protocol) when it is
+ready, and from then on that it makes progress: `Heartbeat.beat` is called where work is done, not
+by a timer, so that a process that hangs is replaced. It also writes a report on itself to
 `health/<process>.json` in the runtime folder; `station status` and the metrics are made from there,
 whether the process still answers or not.
 """
@@ -27,7 +27,7 @@ from typing import Any
 import platformdirs
 
 from station.core.errors import BoothError
-from station.core.files import held, private_folder, read_small
+from station.core.files import held, private_folder, read_bounded_json
 
 CACHE_VARIABLE = "BOOTH_CACHE"
 """Names the folder of all caches; the user's cache folder if unset."""
@@ -37,7 +37,7 @@ _NUMBA_VARIABLE = "NUMBA_CACHE_DIR"
 _PR_SET_PDEATHSIG = 1
 _BEAT_PERIOD_S = 0.5
 _HEALTH_PERIOD_S = 0.25
-_MOST_HEALTH_BYTES = 1 << 20
+_MAX_HEALTH_BYTES = 1 << 20
 
 
 def stop_event() -> threading.Event:
@@ -62,19 +62,19 @@ def set_up_logs(process: str) -> logging.Logger:
 
 @contextlib.contextmanager
 def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]:
-    """Begin of a process that runs once for each runtime folder; gives its log.
+    """Start of a process that runs once per runtime folder; yields its log.
 
     Raises:
-        BoothError: it runs already.
+        BoothError: it is already running.
     """
     lock = runtime_folder / f"{file_name(process)}.lock"
-    busy = BoothError(f"a {process} process runs already here ({lock}); end it first")
+    busy = BoothError(f"a {process} process is already running here ({lock}); end it first")
     with held(lock, busy):
         yield set_up_logs(process)
 
 
 def set_up_caches() -> None:
-    """Let compiled code be kept where this process may write; call it before numba is imported.
+    """Choose a writable cache folder for compiled code; call this before numba is imported.
 
     In $BOOTH_CACHE if that is set, else beside the code (numba's own way), else in the user's cache
     folder, else in a private one for temporary files.
@@ -99,7 +99,8 @@ def _takes_files(folder: Path) -> bool:
 
 
 def notify(state: str) -> None:
-    """Tell the supervisor (sd_notify): "READY=1", "WATCHDOG=1"; nothing where nobody listens."""
+    """Tell the supervisor (sd_notify): "READY=1", "WATCHDOG=1"; does nothing without a
+    supervisor."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -110,7 +111,7 @@ def notify(state: str) -> None:
 
 
 class Heartbeat:
-    """A process' sign of progress and its word about itself.
+    """Progress messages and health report of a process.
 
     The health file is written by a thread of its own: a stalled disk must not stop a main loop.
     """
@@ -125,30 +126,30 @@ class Heartbeat:
 
     @property
     def due(self) -> bool:
-        """Whether it is time for new health."""
+        """Whether it is time for a new health report."""
         return time.monotonic() - self._told_s >= _HEALTH_PERIOD_S
 
     def ready(self) -> None:
-        """The process does its work from here on."""
+        """Report that the process is ready."""
         notify("READY=1")
         self.beat()
 
     def beat(self) -> None:
-        """Work was done, or there was none to do. Cheap: call it in every round."""
+        """Report progress, also when there was nothing to do. Cheap: call it in every loop."""
         now_s = time.monotonic()
         if now_s - self._beat_s >= _BEAT_PERIOD_S:
             self._beat_s = now_s
             notify("WATCHDOG=1")
 
     def allow(self, seconds: float | None) -> None:
-        """Let the process be without progress for longer; None: as long as usual again."""
+        """Extend the time limit for progress; None restores the usual one."""
         usual_us = int(os.environ.get("WATCHDOG_USEC", "0") or 0)
         limit_us = usual_us if seconds is None else int(1e6 * seconds)
         if usual_us:
             notify(f"WATCHDOG_USEC={limit_us}\nWATCHDOG=1")
 
-    def tell(self, content: Mapping[str, Any]) -> None:
-        """Replace what the process says of itself; see `due`."""
+    def report(self, content: Mapping[str, Any]) -> None:
+        """Replace the health report; see `due`."""
         self._told_s = time.monotonic()
         self._content = {
             "process": self._process,
@@ -176,8 +177,8 @@ def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
     """Last report of a process, with `age_s`, the seconds since; empty if there is none."""
     path = runtime_folder / HEALTH / f"{file_name(process)}.json"
     try:
-        content = read_small(path, _MOST_HEALTH_BYTES)
-        # Of an earlier boot, monotonic times mean nothing.
+        content = read_bounded_json(path, _MAX_HEALTH_BYTES)
+        # Monotonic times of an earlier boot mean nothing.
         age_s = time.monotonic() - float(content["told_s"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}

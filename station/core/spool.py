@@ -1,15 +1,16 @@
-"""The spool: where scans wait, are worked on and are delivered. Disk is the truth.
+"""The spool: where scans wait, are worked on and are delivered. The disk is the single source of
+truth.
 
     tmp/       being written
-    scans/     what is noted of each scan (`station.core.scans`)
+    scans/     notes of scans (`station.core.scans`)
     queue/     accepted scans (bundles)
     work/      claimed by a worker
     outbox/    results, whole or not at all
     failed/    bundles that could not be reconstructed, with reason.json
     done/      bundles of delivered scans, until retention removes them
 
-A worker claims a scan by a file lock and a rename. A dead process drops its lock, and any peer
-puts the scan back. Locks and renames need one local file system.
+A worker claims a scan by a file lock and a rename. The lock of a dead process is released, and any
+other worker puts the scan back. Locks and renames need one local file system.
 """
 
 from __future__ import annotations
@@ -25,24 +26,30 @@ from dataclasses import replace
 from pathlib import Path
 
 from station.core.errors import SpoolError
-from station.core.files import fsync_folder, private_folder, publish_folder, read_small, write_json
+from station.core.files import (
+    fsync_folder,
+    private_folder,
+    publish_folder,
+    read_bounded_json,
+    write_json,
+)
 from station.core.scans import Notes, ScanId, ScanNote, Stage, boot_id, is_scan_id
 
 STATES = ("queue", "work", "outbox", "failed", "done")
 REASON = "reason.json"
-MOST_DEATHS = 10
-"""Ends of the station, not of a job, cost a scan none of its tries; a scan that ends the station so
-often is given up."""
+MAX_DEATHS = 10
+"""Ends of the station, unlike those of a job, do not count as tries of a scan; a scan during which
+the station ends this often is given up."""
 _BUNDLE_BYTES = 40 << 20
-"""More than forty depth frames take."""
+"""Larger than a bundle of forty depth frames."""
 _LOG = logging.getLogger("spool")
 
 
 def count_scans(folder: Path) -> dict[str, int]:
-    """State -> how many scans of a spool are in it; touches nothing.
+    """State -> how many scans of a spool are in it; read-only.
 
     Raises:
-        OSError: the spool is another user's.
+        OSError: the spool belongs to another user.
     """
     found = {state: folder / state for state in STATES if (folder / state).is_dir()}
     counts = {state: len(list(place.iterdir())) for state, place in found.items()}
@@ -78,7 +85,7 @@ class Spool:
         if free < needed:
             raise SpoolError(
                 f"{self.folder} has {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB are needed "
-                "(spool.min_free_mb); free some space or purge old scans"
+                "(spool.min_free_mb); free some space or run: station purge --old"
             )
 
     def where(self, scan_id: str) -> str | None:
@@ -108,7 +115,7 @@ class Spool:
             OSError: the disk refused; `where` tells whether the scan was accepted all the same.
         """
         if not is_scan_id(scan_id):
-            raise SpoolError(f"{scan_id!a:.80} is no scan id; the bundle is not accepted")
+            raise SpoolError(f"{scan_id!a:.80} is not a valid scan id; the bundle is not accepted")
         note = self.notes.read(ScanId(scan_id))
         known = note is not None and note.stage in ("delivering", "delivered")
         if known or self.where(scan_id) is not None:
@@ -117,7 +124,7 @@ class Spool:
         publish_folder(temporary, self.path("queue", scan_id))
 
     def waiting(self) -> list[ScanId]:
-        """Scan ids in the queue, oldest first; what is no bundle's folder is left alone."""
+        """Scan ids in the queue, oldest first; other folders are ignored."""
         return self._scans_in("queue")
 
     def _scans_in(self, state: str) -> list[ScanId]:
@@ -129,10 +136,10 @@ class Spool:
             )
 
     def claim(self) -> Claim | None:
-        """Take the oldest waiting scan that nobody else takes.
+        """Claim the oldest waiting scan.
 
         Raises:
-            OSError: the disk does not let any waiting scan be claimed.
+            OSError: the disk prevents every waiting scan from being claimed.
         """
         problem: OSError | None = None
         for scan_id in self.waiting():
@@ -166,7 +173,7 @@ class Spool:
             return Claim(self, scan_id, lock, note)
 
     def withdraw(self, scan_id: str, reason: str) -> bool:
-        """Take a waiting scan off the queue into failed/; False if it does not wait (any more)."""
+        """Take a waiting scan off the queue into failed/; False if it is not waiting."""
         if not is_scan_id(scan_id) or not self.path("queue", scan_id).exists():
             return False
         claim = self._claim(ScanId(scan_id))
@@ -176,7 +183,7 @@ class Spool:
         return True
 
     def retry(self, scan_id: ScanId) -> None:
-        """Put a failed scan back into the queue, its tries forgotten.
+        """Put a failed scan back into the queue and reset its tries.
 
         Raises:
             SpoolError: it is not in failed/.
@@ -187,7 +194,7 @@ class Spool:
             if lock is not None:
                 self.unlock(scan_id, lock)
             raise SpoolError(
-                f"scan {scan_id} is not among the failed ones in {bundle.parent}; see station list"
+                f"scan {scan_id} is not among the failed scans in {bundle.parent}; see station list"
             )
         try:
             fresh = ScanNote(scan_id, "accepted", label=self.note(scan_id).label)
@@ -202,7 +209,7 @@ class Spool:
         """Put back the scans of workers that died; fail those that were tried too often.
 
         Also finishes deliveries that a crash cut short. Returns the ids that were put back. A scan
-        that the disk does not let be moved is left for the next call.
+        that cannot be moved is left for the next call.
         """
         back = []
         for scan_id in self._scans_in("work"):
@@ -233,8 +240,8 @@ class Spool:
                 # It got its name before the crash, and was taken from the outbox since.
                 claim.delivered()
         elif note.tries > retries:
-            claim.fail(f"{note.tries} reconstructions ended badly; the last one: {note.reason}")
-        elif note.deaths >= MOST_DEATHS:
+            claim.fail(f"{note.tries} reconstructions failed; the last one: {note.reason}")
+        elif note.deaths >= MAX_DEATHS:
             claim.fail(f"the station ended {note.deaths + 1} times while it worked on this scan")
         else:
             if claim.scan_id not in self.released:
@@ -245,13 +252,13 @@ class Spool:
         return False
 
     def sweep(self) -> None:
-        """Remove what dead writers left behind; what a delivery still needs stays."""
+        """Remove leftovers of dead writers, except those that a delivery still needs."""
         needed = {note.result for scan_id in self._scans_in("work") if (note := self.note(scan_id))}
         for entry in (self.folder / "tmp").iterdir():
             if entry.name not in needed and not _writer_lives(entry.name):
                 shutil.rmtree(entry, ignore_errors=True)
 
-    def every(self) -> Iterator[tuple[str, Path]]:
+    def all_scans(self) -> Iterator[tuple[str, Path]]:
         """All scans: (state, folder)."""
         for state in STATES:
             for entry in sorted((self.folder / state).iterdir()):
@@ -265,7 +272,7 @@ class Spool:
             descriptor = os.open(path, flags, 0o600)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Whoever had it before removes the file: a lock on a removed one locks nothing.
+                # Its previous holder removes the file: a lock on a removed file locks nothing.
                 if os.stat(path).st_ino == os.fstat(descriptor).st_ino:
                     return descriptor
             except BlockingIOError:
@@ -279,7 +286,7 @@ class Spool:
             os.close(descriptor)
 
     def unlock(self, scan_id: ScanId, lock: int) -> None:
-        """Free a scan's lock; its file goes, so that no name outlives its scan."""
+        """Release a scan's lock and remove its file, so that no name outlives its scan."""
         with contextlib.suppress(OSError):
             (self.folder / "locks" / f"{scan_id}.lock").unlink()
         os.close(lock)
@@ -292,7 +299,7 @@ def _writer_lives(name: str) -> bool:
 
 
 class Claim:
-    """A scan that this process, and no other, works on."""
+    """A scan that only this process works on."""
 
     def __init__(self, spool: Spool, scan_id: ScanId, lock: int, note: ScanNote) -> None:
         self.spool, self.scan_id, self.note = spool, scan_id, note
@@ -304,7 +311,7 @@ class Claim:
 
     @property
     def tries(self) -> int:
-        """Reconstructions that ended badly so far."""
+        """Number of failed reconstructions so far."""
         return self.note.tries
 
     def deliver(self, result: Path, verdict: str = "ok", reason: str = "") -> None:
@@ -331,12 +338,12 @@ class Claim:
         self._move("done")
 
     def count_try(self, reason: str) -> None:
-        """Note a reconstruction that ended badly by itself."""
+        """Record a reconstruction that failed on its own."""
         self.note = replace(self.note, tries=self.note.tries + 1, reason=reason)
         self.spool.notes.write(self.note, durable=False)
 
     def count_death(self) -> None:
-        """Note that the worker's process ended while it worked on this scan."""
+        """Record that the worker's process ended while it worked on this scan."""
         self.note = replace(self.note, deaths=self.note.deaths + 1)
         self.spool.notes.write(self.note, durable=False)
 
@@ -347,7 +354,7 @@ class Claim:
         self._move("failed")
 
     def put_back(self) -> None:
-        """Let anybody try again."""
+        """Return the scan to the queue."""
         self._move("queue")
 
     def close(self) -> None:
@@ -357,7 +364,7 @@ class Claim:
             self._lock = None
 
     def release(self) -> None:
-        """Give the claim up where it is; `Spool.recover` looks after the scan."""
+        """Give up the claim; `Spool.recover` takes care of the scan."""
         if self._lock is not None:
             self.spool.released.add(self.scan_id)
             self.close()
@@ -377,8 +384,8 @@ class Claim:
 
 
 def failure_reason(folder: Path) -> str:
-    """Why the bundle in a folder of failed/ was given up."""
+    """Reason why the bundle in a folder of failed/ was given up."""
     try:
-        return str(read_small(folder / REASON, 1 << 16)["reason"])
+        return str(read_bounded_json(folder / REASON, 1 << 16)["reason"])
     except (OSError, ValueError, KeyError, TypeError):
         return "unknown; see the workers' log"

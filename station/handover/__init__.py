@@ -1,1 +1,1 @@
-"""Results handed over to other programs: a folder or a webhook, tried until they have it."""
+"""Results handed over to other programs: a folder or a webhook, retried until it arrives."""

@@ -1,4 +1,4 @@
-"""`station deliver`: hands results over to the programs of [[deliver]], for as long as it takes."""
+"""`station deliver`: hands results over to the programs of [[deliver]], with unlimited retries."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ from station.handover.targets import make_target
 
 _POLL_S = 0.2
 _SETTLED_NS = 1_000_000_000
-"""A folder that changes twice within a tick of its file system's clock shows it once."""
+"""Age below which a folder is read again: changes within one tick of the file system's clock look
+like one."""
 _RESULTS = 100_000
 _HANGS_S = 60.0
-"""A try takes at most ten seconds at a webhook; a folder's may wait for ever for a lost server."""
+"""A try takes at most ten seconds at a webhook; a folder's may wait indefinitely for a lost
+server."""
 
 
 class HandOver:
-    """Every target by itself: one that is slow or gone holds nobody else up."""
+    """Serves each target separately: a slow or missing one does not delay the others."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
@@ -41,7 +43,7 @@ class HandOver:
         self._heart = Heartbeat(config.runtime.folder, "deliver")
 
     def run(self, stop: threading.Event) -> None:
-        """Until told to stop."""
+        """Run until told to stop."""
         threads = [
             threading.Thread(target=self._serve, args=(name, stop), daemon=True)
             for name in self._targets
@@ -62,10 +64,10 @@ class HandOver:
                 problem = f"deliver: the spool cannot be read ({error}); check its disk"
             self._heart.beat()
             if self._heart.due:
-                self._heart.tell(self.health(problem))
+                self._heart.report(self.health(problem))
 
     def health(self, problem: str = "") -> dict[str, Any]:
-        """The process' word about itself: how many results wait for each target, and why."""
+        """Health report: the number of results that wait for each target, and problems."""
         waiting = self._ledger.waiting()
         problems = [problem] if problem else []
         counts = {}
@@ -76,18 +78,18 @@ class HandOver:
             errors = [entry.error for entry in mine if entry.error]
             if now_s - self._round_s[name] > _HANGS_S:
                 problems.append(
-                    f"deliver {name}: the target does not answer since "
+                    f"deliver {name}: the target has not responded for "
                     f"{now_s - self._round_s[name]:.0f} s; check the network and the other machine"
                 )
             elif errors:
                 problems.append(
                     f"deliver {name}: {len(errors)} not handed over ({errors[0]}); "
-                    "it is tried again"
+                    "it will be retried"
                 )
         return {"waiting": counts, "problems": problems}
 
     def look(self) -> None:
-        """Note what is new in the outbox."""
+        """Record new results in the outbox."""
         found = self._index.find(states=["delivered", "rescan"], limit=_RESULTS)
         for section in self._config.deliver:
             wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
@@ -102,7 +104,7 @@ class HandOver:
                 self._log.warning("%s: %s", name, error)
 
     def try_all(self, name: str, now_s: float) -> None:
-        """Hand over what is due to one target."""
+        """Hand over the results that are due to one target."""
         for entry in self._ledger.waiting():
             if entry.target == name and entry.next_s <= now_s:
                 self._round_s[name] = time.monotonic()
@@ -118,7 +120,7 @@ class HandOver:
             after = entry.failed(str(error), now_s)
             self._ledger.keep(after)
             self._log.warning(
-                "%s not handed over to %s (%s); again in %.0f s",
+                "%s not handed over to %s (%s); retrying in %.0f s",
                 entry.scan_id, entry.target, error, after.next_s - now_s,
             )  # fmt: skip
             return

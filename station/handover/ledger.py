@@ -1,4 +1,4 @@
-"""Record of what has been handed over to whom: on disk, so that no restart forgets it.
+"""Record of hand-overs, kept on disk so that it survives a restart.
 
 handover/<target>/waiting/<scan id>.json   tries, when next, what went wrong
 handover/<target>/done/<scan id>           handed over; kept as long as the result is
@@ -17,12 +17,12 @@ from typing import Any
 from station.core.files import fsync_folder, private_folder, write_json
 
 PAUSES_S = (5.0, 15.0, 60.0, 300.0, 900.0, 3600.0)
-"""After the first, second ... failure; then every hour, for ever."""
+"""Pauses after the first, second ... failure; then every hour, without limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """One result that one target has not got yet."""
+    """One result that one target has not received yet."""
 
     target: str
     scan_id: str
@@ -37,7 +37,7 @@ class Waiting:
                 "next_try": moment if self.next_s else "", "error": self.error}  # fmt: skip
 
     def failed(self, error: str, now_s: float) -> Waiting:
-        """After one more try, with a longer pause."""
+        """The entry after one more failure, with a longer pause."""
         pause_s = PAUSES_S[min(self.tries, len(PAUSES_S) - 1)]
         return replace(self, tries=self.tries + 1, next_s=now_s + pause_s, error=error)
 
@@ -49,7 +49,7 @@ class Ledger:
         self._folder = spool_folder / "handover"
 
     def follow(self, target: str, scan_ids: Iterable[str]) -> None:
-        """Note results that are new; forget those that are gone."""
+        """Add new results; remove those that no longer exist."""
         there = set(scan_ids)
         done, waiting = self._place(target, "done"), self._place(target, "waiting")
         for path in [*done.iterdir(), *waiting.glob("*.json")]:
@@ -60,12 +60,12 @@ class Ledger:
                 self.keep(Waiting(target, scan_id))
 
     def keep(self, entry: Waiting) -> None:
-        """Write down what waits."""
+        """Save a waiting result."""
         path = self._place(entry.target, "waiting") / f"{entry.scan_id}.json"
         write_json(path, {"tries": entry.tries, "next_s": entry.next_s, "error": entry.error})
 
     def finish(self, entry: Waiting) -> None:
-        """It has been handed over: never again."""
+        """Mark a result as handed over."""
         done = self._place(entry.target, "done")
         os.close(os.open(done / entry.scan_id, os.O_CREAT | os.O_WRONLY, 0o600))
         fsync_folder(done)
@@ -73,7 +73,7 @@ class Ledger:
         (waiting / f"{entry.scan_id}.json").unlink(missing_ok=True)
 
     def waiting(self) -> list[Waiting]:
-        """All that waits, whoever for."""
+        """All waiting results of all targets."""
         if not self._folder.is_dir():
             return []
         found = []

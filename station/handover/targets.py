@@ -25,7 +25,7 @@ _LINKS = ("mesh.glb", "mesh.obj", "preview.png", "avatar.glb")
 
 
 class HandOverError(BoothError):
-    """The target did not take the result; it is tried again."""
+    """The target did not accept the result; it will be retried."""
 
 
 class Target(Protocol):
@@ -44,7 +44,7 @@ def make_target(config: DeliverConfig) -> Target:
 
 
 class FolderTarget:
-    """Copies a result beside its final name, then renames it: a reader never sees half of one."""
+    """Copies a result under a temporary name, then renames it: a reader never sees part of one."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -54,7 +54,7 @@ class FolderTarget:
         if final.exists():
             return
         if not self._folder.is_dir():
-            raise HandOverError(f"{self._folder} is not there; is the share mounted?")
+            raise HandOverError(f"{self._folder} does not exist; is the share mounted?")
         beside = self._folder / f".{scan.scan_id}.part"
         try:
             if beside.exists():
@@ -75,7 +75,8 @@ class FolderTarget:
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """A redirected POST would carry a body's measurements to wherever the answer says."""
+    """A redirected POST would send a person's measurements to an address that the answer
+    chooses."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str,
@@ -89,8 +90,8 @@ class WebhookTarget:
 
     `Booth-Signature: t=<seconds>,v1=<hex>`, v1 = HMAC-SHA256(secret, "<seconds>." + body). The
     receiver computes it again, compares, and refuses old times. `Idempotency-Key` is the same
-    whenever the same result is posted again: the station may die between the receiver's answer
-    and writing it down.
+    whenever the same result is posted again: the station may die between the receiver's answer and
+    recording it.
     """
 
     def __init__(self, name: str, url: str, secret_file: Path, link: str) -> None:

@@ -1,7 +1,7 @@
 """Intake of the capture processes' messages: frames, and the cameras' health.
 
 A message that cannot be read is counted and dropped, whoever sent it: a capture process of another
-release must not end its readers.
+release must not crash its readers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from station.core.errors import FormatError
 from station.messaging.messages import CameraHealth, FrameHeader, SensorInfo
 from station.messaging.transport import subscriber
 
-_MOST_AT_ONCE = 64
-"""Frames taken before whoever reads them has a look at something else."""
+_MAX_AT_ONCE = 64
+"""Frames read at once before the caller can do other work."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveFrame:
-    """A frame as it came: the pixels are the message's own memory."""
+    """A frame as received; the pixels share the message's memory."""
 
     header: FrameHeader
     depth: NDArray[np.uint16]
@@ -55,9 +55,9 @@ class FrameIntake:
         self.last_problem = ""
 
     def frames(self, timeout_s: float = 0.0) -> Iterator[LiveFrame]:
-        """The frames that have come; waits for the first message if there is none."""
+        """The frames that have arrived; waits for the first message if there is none."""
         wait_ms = int(1000 * timeout_s)
-        for _ in range(_MOST_AT_ONCE):
+        for _ in range(_MAX_AT_ONCE):
             if not self.socket.poll(wait_ms):
                 return
             wait_ms = 0
@@ -72,20 +72,20 @@ class FrameIntake:
                 yield frame
 
     def silent(self, limit_s: float) -> list[str]:
-        """The cameras that gave no frame for so long."""
+        """The cameras that have sent no frame for this long."""
         now_s = time.monotonic()
         return sorted(
             name for name in self._cameras if now_s - self.last_frame_s.get(name, -1e9) > limit_s
         )
 
     def why(self, camera: str) -> str:
-        """Reason in brackets that a camera's process gives for missing frames; may be empty."""
+        """Reason, in brackets, that a camera's process reports for missing frames; may be empty."""
         health = self.health.get(camera)
         return f" ({health.detail or health.state})" if health else ""
 
     def _take(self, parts: list[memoryview]) -> LiveFrame | None:
         if len(parts) < 2:
-            raise FormatError(f"a message of {len(parts)} part came, not of two or three")
+            raise FormatError(f"a message has {len(parts)} parts, not two or three")
         kind = bytes(parts[0]).split(b"/")[0]
         if kind == b"health":
             health = CameraHealth.unpack(parts[1])

@@ -1,7 +1,7 @@
 """Every message that crosses a socket: fields, units, version.
 
-A message is a msgpack map with its type and version. One of another type or version is refused
-with words; nothing is ever unpickled.
+A message is a msgpack map with its type and version. One of another type or version is rejected
+with an explanation; nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import msgpack
 
 from station.core.errors import FormatError
 
-_MOST_PIXELS = 4096
+_MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
-_MOST_TEXT = 10_000
+_MAX_TEXT = 10_000
 _KINDS: dict[str, type | tuple[type, ...]] = {
     "str": str,
     "int": int,
@@ -45,7 +45,7 @@ class Message:
         """The message of packed bytes.
 
         Raises:
-            FormatError: it is torn, of another type or version, or a value is impossible.
+            FormatError: it is torn, of another type or version, or a value is invalid.
         """
         try:
             content = msgpack.unpackb(data)
@@ -53,12 +53,12 @@ class Message:
             raise FormatError(f"a message is torn ({cause})") from None
         if not isinstance(content, dict) or content.get("type") != cls.__name__:
             found = content.get("type") if isinstance(content, dict) else type(content).__name__
-            raise FormatError(f"a {cls.__name__} message was expected, {found!a:.80} came")
+            raise FormatError(f"a {cls.__name__} message was expected, not {found!a:.80}")
         version = content.get("version")
         if version != cls.VERSION or isinstance(version, bool):
             raise FormatError(
-                f"{cls.__name__} has version {version!a:.80}, this program speaks "
-                f"{cls.VERSION}; run the same release everywhere"
+                f"{cls.__name__} has version {version!a:.80}, this program uses {cls.VERSION}; "
+                "run the same release everywhere"
             )
         values = {key: value for key, value in content.items() if key not in ("type", "version")}
         known = {item.name: str(item.type) for item in fields(cls)}
@@ -74,7 +74,7 @@ class Message:
         return message
 
     def impossible(self) -> str | None:
-        """Name of a value that is impossible beyond its type; None if there is none."""
+        """Name of a value that is invalid despite its type; None if there is none."""
         return None
 
 
@@ -84,7 +84,7 @@ def _is(value: object, kind: str) -> bool:
     if kind == "float":
         return isinstance(value, int | float) and isfinite(value)
     if isinstance(value, str):
-        return len(value) <= _MOST_TEXT
+        return len(value) <= _MAX_TEXT
     if kind == "list[float]":
         return isinstance(value, list) and all(_is(item, "float") for item in value)
     if kind == "list[list[float]]":
@@ -111,10 +111,10 @@ class FrameHeader(Message):
     """Time at which it reached the host, same clock."""
     sequence: int
     clock_resets: int
-    """Resets of the sensor's clock so far: times before and after one have nothing in common."""
+    """Resets of the sensor's clock so far: times before and after one cannot be compared."""
 
     def impossible(self) -> str | None:
-        if not (0 < self.width <= _MOST_PIXELS and 0 < self.height <= _MOST_PIXELS):
+        if not (0 < self.width <= _MAX_PIXELS and 0 < self.height <= _MAX_PIXELS):
             return f"an image of {self.width} x {self.height}"
         if not (0.0 < self.depth_scale_m < 0.1 and self.tick_hz > 0.0):
             return f"depth_scale_m {self.depth_scale_m}, tick_hz {self.tick_hz}"
@@ -156,7 +156,8 @@ class SensorInfo(Message):
 
 @dataclass(frozen=True, slots=True)
 class DesiredState(Message):
-    """The operator's order, repeated: capture processes follow it, however often it comes."""
+    """The operator's start or stop, repeated: capture processes follow it, however often it
+    arrives."""
 
     streaming: bool
 
@@ -172,12 +173,12 @@ class Request(Message):
     scan_id: str = ""
     label: str = ""
     valid_until_s: float = 0.0
-    """A scan that is taken up later is void; host's monotonic clock. 0: control sets it."""
+    """Deadline for starting the scan, host's monotonic clock. 0: control sets it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply(Message):
-    """Its answer."""
+    """The reply to a request."""
 
     ok: bool
     error: str = ""
@@ -186,7 +187,7 @@ class Reply(Message):
 
 @dataclass(frozen=True, slots=True)
 class ScanEvent(Message):
-    """Progress of a scan. The verdict is on disk too; a program that missed it asks control."""
+    """Progress of a scan. The outcome is on disk too; a program that missed it asks control."""
 
     scan_id: str
     state: str

@@ -1,6 +1,6 @@
 """Every topic that is published. Sockets, silence limits and health follow from this table.
 
-Nothing here is relied upon: scans are on disk, commands have replies, and a lost message is counted
+No message is critical: scans are on disk, commands have replies, and a lost message is counted
 where it matters (frames have sequence numbers).
 """
 
@@ -16,7 +16,7 @@ class Topic:
     rate_hz: float
     """Rate at which its sender publishes it."""
     max_age_s: float
-    """Without a new one for so long, its sender is named as silent."""
+    """Without a new one for this long, its sender is reported as silent."""
     high_water_mark: int
     """Most messages that wait for a slow reader; more are lost."""
 

@@ -22,13 +22,13 @@ STATION_LOCK = "station.lock"
 
 
 class NoAnswerError(BoothError):
-    """A process did not answer in time: what was asked may be done all the same."""
+    """A process did not answer in time; it may carry out the request anyway."""
 
 
 def endpoint(runtime_folder: Path, name: str) -> str:
     """The ipc address of a named socket in the booth's runtime folder.
 
-    A folder with too long a path is stood in for by a short private one derived from it.
+    A folder whose path is too long is replaced by a short private one derived from it.
     """
     folder = runtime_folder
     if len(str(folder / f"{name}.ipc").encode()) > _LONGEST_PATH:
@@ -116,10 +116,10 @@ def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> 
             return Reply.unpack(socket.recv())
         except zmq.Again:
             remedy = (
-                "it is started again when it hangs; ask again in 15 s"
+                "a process that hangs is restarted; try again in 15 s"
                 if any(is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock"))
                 else "is it running? start it with: station run"
             )
             raise NoAnswerError(
-                f"the station's {name} process does not answer within {timeout_s:g} s; {remedy}"
+                f"the station's {name} process did not answer within {timeout_s:g} s; {remedy}"
             ) from None

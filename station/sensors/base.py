@@ -1,7 +1,7 @@
 """The interface of depth sensor drivers.
 
 A driver is a class with these three methods, made from its camera's section of booth.toml. It is
-found through an entry point, see `station.core.drivers`; nothing else has to know it.
+found through an entry point, see `station.core.drivers`; no other code refers to it.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class DeviceInfo:
 
 
 def is_serial(text: str) -> bool:
-    """Whether a serial number tells one device from others; a recording's name does not."""
+    """Whether a serial number identifies a device; a recording's name does not."""
     return bool(text) and ":" not in text
 
 
 @dataclass(frozen=True, slots=True)
 class DepthFrame:
-    """One depth image as the sensor gave it."""
+    """One depth image as the sensor sent it."""
 
     depth: NDArray[np.uint16]
     """(height, width) in units of ``DeviceInfo.depth_scale_m``; 0 = no reading."""
@@ -53,7 +53,7 @@ class DepthFrame:
 
 
 class DepthDriver(Protocol):
-    """A sensor's life: open, read until closed. One thread calls all three."""
+    """Life cycle of a sensor: open, read, close. All three are called from one thread."""
 
     def open(self) -> DeviceInfo:
         """Start the sensor.
@@ -67,7 +67,7 @@ class DepthDriver(Protocol):
         """The next frame, or None if none came within the time.
 
         Raises:
-            DriverError: the sensor is gone for good and has to be opened anew.
+            DriverError: the sensor is disconnected and has to be opened again.
         """
         ...
 

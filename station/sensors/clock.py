@@ -15,11 +15,12 @@ _WINDOW_S = 30.0
 _BUCKET_S = 0.5
 _MAX_DRIFT = 0.05
 """Crystals differ by far less; a replay may play a few per cent slower than its ticks say."""
-_LEAST_SPAN_S = 2.0
+_MIN_SPAN_S = 2.0
 _JUMP_S = 1.0
 _STALE_S = 0.1
-"""Frames this late, one after the other, say that the line no longer holds: a replay that plays
-slower than it was recorded, say. It is learned anew; after a mere stall it comes back at once."""
+"""Frames this late, one after the other, show that the line is no longer valid, for example because
+a replay is slower than its recording. It is then learned again; after a mere stall it is valid
+again at once."""
 
 
 @dataclass(slots=True)
@@ -48,13 +49,13 @@ class DeviceClock:
         if len(self._envelope) < 2:
             return None
         (x0, y0), (x1, y1) = self._envelope[0], self._envelope[-1]
-        return (y1 - y0) / (x1 - x0) if x1 - x0 > _LEAST_SPAN_S else None
+        return (y1 - y0) / (x1 - x0) if x1 - x0 > _MIN_SPAN_S else None
 
     def host_time_s(self, ticks: int, arrival_s: float) -> float:
         """Time at which a frame was taken, on the host's monotonic clock, in seconds.
 
         A counter that jumps back, or apart from the host's clock by over a second, was reset: the
-        model starts anew.
+        model starts over.
         """
         device_s = self._unwrapped_s(ticks, arrival_s)
         delay_s = arrival_s - device_s
@@ -90,7 +91,8 @@ class DeviceClock:
         envelope = self._envelope
         if envelope and device_s - envelope[-1][0] < _BUCKET_S:
             if delay_s < envelope[-1][1]:
-                # The bucket keeps its age, so that it ends; the point moves to the better reading.
+                # The bucket keeps its age, so that it expires; the point moves to the better
+                # reading.
                 envelope[-1] = (envelope[-1][0], delay_s)
         else:
             envelope.append((device_s, delay_s))
@@ -100,7 +102,7 @@ class DeviceClock:
     def _offset_at(self, device_s: float) -> float:
         points = list(self._envelope)
         span_s = points[-1][0] - points[0][0]
-        if span_s < _LEAST_SPAN_S:
+        if span_s < _MIN_SPAN_S:
             return min(delay for _, delay in points)
         hull = _lower_hull(points)
         middle = 0.5 * (points[0][0] + points[-1][0])

@@ -1,7 +1,7 @@
 """Kinect v1 through libfreenect (ctypes), or its replay library: the very same code.
 
-Raw 11-bit disparities become depth by the formula of station.core.kinect_v1 for every unit: what a
-unit deviates from it is smooth, and the calibration's depth correction takes it out.
+Raw 11-bit disparities become depth by the formula of station.core.kinect_v1 for every unit: each
+unit's deviation from it is smooth, and the calibration's depth correction removes it.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class FreenectDriver:
         try:
             self._library = ctypes.CDLL(str(path))
         except OSError as cause:
-            raise DriverError(f"{path} cannot be loaded ({cause}); install it anew") from None
+            raise DriverError(f"{path} cannot be loaded ({cause}); reinstall it") from None
         _declare(self._library)
         self._open_device(self._library)
         self._stop.clear()
@@ -177,7 +177,9 @@ class FreenectDriver:
             or library.freenect_start_depth(self._device) < 0
         ):
             self._release()
-            raise DriverError(f"{self._name}: depth does not start; unplug it and plug it in again")
+            raise DriverError(
+                f"{self._name}: its depth stream does not start; unplug it and plug it in again"
+            )
 
     def _on_depth(self, device: int, data: int, ticks: int) -> None:
         del device
@@ -189,7 +191,7 @@ class FreenectDriver:
         try:
             self._frames.put_nowait(arrived)
         except queue.Full:
-            # The reader is late: the gap in the sequence tells of the loss.
+            # The reader is late: the gap in the sequence shows the loss.
             return
 
     def _run_events(self) -> None:
@@ -206,7 +208,7 @@ class FreenectDriver:
             else:
                 failures = 0
         if failures:
-            self._failure = f"{self._name} is gone or at its end; check its cable"
+            self._failure = f"{self._name} was disconnected or its recording ended; check its cable"
 
     def read(self, timeout_s: float) -> DepthFrame | None:
         try:
@@ -218,7 +220,7 @@ class FreenectDriver:
             if self._failure:
                 raise DriverError(self._failure) from None
             if time.monotonic() - self._last_s > _SILENT_S:
-                raise DriverError(f"{self._name} sends no frames; it is opened again") from None
+                raise DriverError(f"{self._name} sends no frames; reopening it") from None
             return None
         self._last_s = arrived.received_s
         depth = TABLE[arrived.raw.reshape(HEIGHT, WIDTH) & 2047]
@@ -236,7 +238,7 @@ class FreenectDriver:
         if self._pump is not None:
             self._pump.join(timeout=2.0)
             if self._pump.is_alive():
-                # The library hangs in a call; releasing under it would crash the process.
+                # The library hangs in a call; releasing it now would crash the process.
                 return
             self._pump = None
         self._release()

@@ -29,7 +29,7 @@ class RecordedFrame:
     """One depth frame of a recording."""
 
     seconds: float
-    """Time at which it was received; the replay library paces by it."""
+    """Time at which it was received; the replay library uses it for pacing."""
     ticks: int
     """Device timestamp, 32 bits."""
     raw: NDArray[np.uint16]

@@ -43,7 +43,7 @@ class VirtualDriver:
         self._sequence = 0
 
     def open(self) -> DeviceInfo:
-        # The ray caster is 230 MB: only who opens a simulated sensor carries it.
+        # The ray caster is 230 MB: it is imported only when a simulated sensor is opened.
         from station.simulation.scene import load_mesh
         from station.simulation.sensor import SimulatedBooth, VirtualCamera
 

@@ -1,8 +1,8 @@
 """The errors of a structured-light Kinect v1 on a true depth image.
 
 Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
-and fly: Nguyen, Izadi & Lovell 2012. (What reads the images assumes the other published law, that
-of Khoshelham & Elberink: it shall not be judged by its own assumption.) Errors are correlated over
+and fly: Nguyen, Izadi & Lovell 2012. (The reconstruction assumes another published model, that of
+Khoshelham & Elberink, so that it is not tested with its own assumption.) Errors are correlated over
 the matching window of about 9 x 9 px; there is no reading beyond 70-75 degrees of incidence or in
 the projector's shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
 """
@@ -23,7 +23,7 @@ _FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
 _STEEP_RAD = np.radians(60.0)
 _RANGE_M = (0.5, 4.5)
 _MIDDLE_M = 1.0 / 0.6
-"""From here a unit's curvature counts."""
+"""Depth that a unit's curvature refers to."""
 
 Image = NDArray[np.float32]
 
@@ -67,7 +67,7 @@ class UnitError:
     tilt: tuple[float, float] = (0.0, 0.0)
     """Relative change of it over the image, per half width and half height."""
     gain: float = 0.0
-    """Relative error of all inverse depths: a baseline or a focal length that is not quite so."""
+    """Relative error of all inverse depths: a baseline or a focal length that is slightly off."""
     curvature: float = 0.0
     """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
 

@@ -77,7 +77,7 @@ class VirtualProcedure:
         index = list(self.booth.rig.cameras).index(camera)
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, self._board_y_m(step))
-        # Behind what moves a short loop flickers on; only what moves is drawn anew each frame.
+        # The background is a short loop with noise; only moving objects are drawn in each frame.
         moves = step in (BALL, MARK, FRONT) or step.startswith(AROUND)
         still = NoiselessView.of(view, unit.error)
         loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]

@@ -22,7 +22,7 @@ from station.simulation.sensor import (
 
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
-"""Each unit's systematic depth error where a calibration has to find it."""
+"""Each unit's systematic depth error if a calibration is recorded."""
 _BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 
@@ -36,13 +36,13 @@ _PROCESSES = 2
 )
 @click.option("--seed", default=0, show_default=True, help="of the noise and the clocks")
 @click.option("--frames", default=30, show_default=True, help="different frames per camera")
-@click.option("--passes", default=40, show_default=True, help="how often they are repeated")
+@click.option("--passes", default=40, show_default=True, help="number of times they are repeated")
 @click.option(
     "--driver",
     type=click.Choice(["freenect", "recorded"]),
     default="freenect",
     show_default=True,
-    help="how the booth.toml written beside them reads them",
+    help="driver named in the booth.toml that is written beside them",
 )
 @click.option(
     "--calibration",

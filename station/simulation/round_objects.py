@@ -1,7 +1,7 @@
 """Balls and limbs that move through a virtual booth, seen exactly and fast.
 
-A calibration looks at tens of thousands of frames in which little moves: what stands still is ray
-cast once, and balls and capsules (rods with round ends) are laid over it in closed form.
+A calibration looks at tens of thousands of frames in which little moves: static objects are ray
+cast once, and balls and capsules (rods with round ends) are overlaid in closed form.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _SHADOW_TOLERANCE_M = 1e-4
 _MARGIN_PX = 14
-"""Margin around moving objects that is drawn anew: their edges flicker."""
+"""Margin around moving objects that is redrawn, since their edges flicker."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ TICK_HZ = 60_000_000
 FRAME_RATE_HZ = 30.0
 _SWAY_PERIOD_S = 3.1
 _LEAN_STEP_M = 0.00025
-"""A view is rendered anew when the person leans by so much more: far below the sensor's noise."""
+"""A view is rendered again when the lean has changed by this much: far below the sensor's noise."""
 _FACTORY_SIGMA = (3e-4, 1.5e-3)
 """Gain and curvature of inverse depth among units that have depth errors at all."""
 

@@ -12,7 +12,7 @@ import pytest
 
 from station.core.bundle import read_bundle
 from station.core.geometry import so3_exp
-from workers.cloud.bare import _consistent, read_cloud
+from workers.cloud.cloud_file import _consistent, read_cloud
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.scape.fit.fit import FitResult, fit_body

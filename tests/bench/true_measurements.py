@@ -1,7 +1,7 @@
 """Measures a true body for the benchmark, sharing with the product's measuring only the written
 definitions: the table of rows, the landmarks' vertices, the parts' names.
 
-Everything is done another way. A plane cuts whole triangles into segments; a tape around them is
+Everything is done another kind. A plane cuts whole triangles into segments; a tape around them is
 as long as the mean of the section's widths over all directions times pi (Cauchy's formula for
 convex curves); a tape over the skin follows the envelope of the section above its chord.
 """
@@ -17,10 +17,10 @@ from workers.measure.kinds import (
     Drop,
     Foremost,
     Level,
+    Perpendicular,
     Plane,
     Route,
     Section,
-    Square,
     Top,
 )
 from workers.scape.model.body_model import BodyModel
@@ -55,22 +55,22 @@ class TrueBody:
         return found
 
     def _value(self, row: Definition) -> float:
-        way = row.way
-        if isinstance(way, Top):
-            return float(self._v[self._part == way.part, 2].max())
-        if isinstance(way, Drop):
-            return max(0.0, float(self._at[way.upper][2] - self._at[way.lower][2]))
-        if isinstance(way, Route):
-            return self._route(way)
-        return self._section(row, way)
+        kind = row.kind
+        if isinstance(kind, Top):
+            return float(self._v[self._part == kind.part, 2].max())
+        if isinstance(kind, Drop):
+            return max(0.0, float(self._at[kind.upper][2] - self._at[kind.lower][2]))
+        if isinstance(kind, Route):
+            return self._route(kind)
+        return self._section(row, kind)
 
-    def _section(self, row: Definition, way: Section) -> float:
-        point, normal = self._plane(way.plane)
-        segments = self._segments(point, normal, way.parts)
-        if not way.whole:
+    def _section(self, row: Definition, kind: Section) -> float:
+        point, normal = self._plane(kind.plane)
+        segments = self._segments(point, normal, kind.parts)
+        if not kind.whole:
             segments = _nearest_chain(segments, point)
         points = segments.reshape(-1, 3)
-        if way.across is None:
+        if kind.across is None:
             helper = np.eye(3)[np.argmin(np.abs(normal))]
             x = np.cross(normal, helper)
             x /= np.linalg.norm(x)
@@ -78,7 +78,7 @@ class TrueBody:
             angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
             reach = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
             return float(np.pi * np.ptp(reach, axis=0).mean())
-        side, other = way.across
+        side, other = kind.across
         across = self._at[other] - self._at[side]
         across = across - normal * (normal @ across)
         across /= np.linalg.norm(across)
@@ -103,7 +103,7 @@ class TrueBody:
                 if part in plane.parts and heights[0] <= place[2] <= heights[1]
             )
             return np.array(best[1]), np.array([0.0, 0.0, 1.0])
-        if isinstance(plane, Square):
+        if isinstance(plane, Perpendicular):
             line = at[plane.end] - at[plane.start]
             share = plane.share
             if plane.beyond:
@@ -133,16 +133,16 @@ class TrueBody:
             ends.append(start + share[:, None] * (corners[index, other] - start))
         return np.stack(ends, axis=1)
 
-    def _route(self, way: Route) -> float:
-        names = list(way.landmarks) + ([way.landmarks[0]] if way.closed else [])
+    def _route(self, kind: Route) -> float:
+        names = list(kind.landmarks) + ([kind.landmarks[0]] if kind.closed else [])
         total = 0.0
-        for index, leg in enumerate(way.legs):
+        for index, leg in enumerate(kind.legs):
             if leg == "floor":
                 total += float(self._at[names[index]][2])
             elif leg == "straight":
                 total += float(np.linalg.norm(self._at[names[index + 1]] - self._at[names[index]]))
             else:
-                total += self._over(names[index], names[index + 1], way.parts, leg == "tape")
+                total += self._over(names[index], names[index + 1], kind.parts, leg == "tape")
         return total
 
     def _over(self, start: str, end: str, parts: tuple[str, ...], taut: bool) -> float:
@@ -168,7 +168,7 @@ class TrueBody:
         line = np.concatenate([[[0.0, 0.0]], line, [[length, 0.0]]])
         if not taut:
             return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-        # A taut tape: the shortest way that stays above, by relaxing towards the chord from above.
+        # A taut tape: the shortest kind that stays above, by relaxing towards the chord from above.
         angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
         line[:, 1] = np.maximum(line[:, 1], 0.0)
         reach = np.outer(line[:, 0], np.cos(angle)) + np.outer(line[:, 1], np.sin(angle))

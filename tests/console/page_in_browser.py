@@ -172,7 +172,7 @@ def test_a_result_turns_and_lights_up(
     expect(value).not_to_have_text(f"{centimetres:.1f}")
     assert float(value.inner_text()) == pytest.approx(centimetres / 2.54, abs=0.03)
     page.get_by_role("button", name="Standard pose").click()
-    expect(page.get_by_text("Lines show where")).to_be_visible()
+    expect(page.get_by_text("The lines are drawn")).to_be_visible()
     # A line is touched: its row is found. The waist's line crosses the middle of the body.
     page.click("tr[data-name=waist_girth]")
     page.get_by_role("button", name="Front").click()

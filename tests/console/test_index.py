@@ -141,7 +141,7 @@ def test_list_and_find_on_the_command_line(spool: Spool) -> None:
     assert "scan again" in listed.output
     found = CliRunner().invoke(station, ["find", "order 1234", "--json", *option])
     assert [scan["scan_id"] for scan in json.loads(found.output)] == ["20261121T100000Z-0001"]
-    assert "no scan with 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
+    assert "no scan matches 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
 
 
 def test_purge_by_label(spool: Spool) -> None:

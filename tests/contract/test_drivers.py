@@ -117,7 +117,7 @@ def test_its_keys_are_as_strict_as_all_others(
 
 
 def test_a_driver_that_plays_no_recordings_says_so(config_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the driver pretend plays no recordings"):
+    with pytest.raises(ConfigError, match="the driver pretend cannot play recordings"):
         load_config(config_path).camera("a").replaying(Path("somewhere"))
 
 

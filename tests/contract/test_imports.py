@@ -26,7 +26,7 @@ PURE_FOLDERS = (
     "workers/measure",
 )
 OPEN3D = ("workers/", "station/simulation/")
-MOST_MODULES = 14
+MAX_MODULES = 14
 
 
 def _imports(path: Path) -> Iterator[str]:
@@ -114,7 +114,7 @@ def test_no_folder_is_too_wide_to_find_a_module_in() -> None:
     wide = {
         str(folder): count
         for folder, count in folders.items()
-        if count > MOST_MODULES + (folder / "__init__.py").exists()
+        if count > MAX_MODULES + (folder / "__init__.py").exists()
     }
     assert wide == {}
 

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "systemd"
 COMMON = UNITS / "booth-.service.d/10-common.conf"
 SERVICES = sorted(UNITS.glob("booth-*.service"))
-MOST_EXPOSED = 1.5
+MAX_EXPOSURE = 1.5
 """systemd-analyze's exposure, from 0 (safe) to 10."""
 
 
@@ -145,7 +145,7 @@ def test_systemd_finds_nothing_wrong(root: Path) -> None:
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
 def test_a_service_may_do_little_beside_its_work(root: Path, path: Path) -> None:
     name = path.name.replace("@.", "@front.")
-    limit = f"--threshold={round(10 * MOST_EXPOSED)}"
+    limit = f"--threshold={round(10 * MAX_EXPOSURE)}"
     done = subprocess.run(
         ["systemd-analyze", f"--root={root}", "security", "--offline=true", limit, name],
         capture_output=True,

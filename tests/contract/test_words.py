@@ -1,4 +1,4 @@
-"""Docstrings begin with a noun or a verb: a question word first makes the reader guess."""
+"""Docstrings begin with a noun or a verb, not with a question word."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-RIDDLE = re.compile(r"(Of|What|Whom|Whose|Who|Where|When|How|Which)\b")
+RIDDLE = re.compile(r"(Of|What|Whom|Whose|Who|Why|Where|When|How|Which|Until)\b")
 """Openings that leave out their subject; "Whether ..." says that a value is a truth value."""
 
 

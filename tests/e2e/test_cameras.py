@@ -114,7 +114,7 @@ def test_commands_without_a_station_end_with_the_remedy(booth: Path, tmp_path: P
     assert done.returncode == 1
     assert "station run" in done.stderr
     assert done.stdout.startswith("spool: 1 outbox;")
-    assert "no process of the booth runs here" in done.stdout
+    assert "no process of the booth is running here" in done.stdout
 
 
 def test_one_station_to_a_runtime_folder(make_station: Callable[..., Station]) -> None:
@@ -124,7 +124,7 @@ def test_one_station_to_a_runtime_folder(make_station: Callable[..., Station]) -
         capture_output=True, text=True, timeout=20, check=False,
     )  # fmt: skip
     assert second.returncode == 1
-    assert "a station runs already" in second.stderr
+    assert "a station is already running" in second.stderr
 
 
 def test_status_lists_every_process_and_names_a_console_that_hangs(
@@ -155,7 +155,7 @@ def test_status_lists_every_process_and_names_a_console_that_hangs(
     assert "is the share mounted?" in shown
     [victim] = station.pids("station.cli", "console")
     os.kill(victim, signal.SIGSTOP)
-    station.wait_until(says("the console process has said nothing"), "the hung console is named")
+    station.wait_until(says("the console process has not reported"), "the hung console is named")
     station.wait_until(
         lambda: told()["console"].get("pid") not in (None, victim),
         "the hung console is replaced",
@@ -176,7 +176,7 @@ def test_one_process_of_a_kind_to_a_runtime_folder(tmp_path: Path, process: str)
             capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert second.returncode == 1
-    assert "runs already here" in second.stderr
+    assert "is already running here" in second.stderr
 
 
 @pytest.mark.parametrize("scan_id", ["../../escape", "a\nb", "x" * 65, "\x1b[2J"])
@@ -190,5 +190,5 @@ def test_a_strange_scan_id_is_refused_at_the_door(tmp_path: Path, scan_id: str) 
             capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
         assert done.returncode == 1
-        assert "no scan id" in done.stderr
+        assert "not a valid scan id" in done.stderr
         assert "\x1b" not in done.stderr

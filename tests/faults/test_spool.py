@@ -8,7 +8,7 @@ import pytest
 
 from station.core.errors import SpoolError
 from station.core.scans import ScanId
-from station.core.spool import MOST_DEATHS, Spool, failure_reason
+from station.core.spool import MAX_DEATHS, Spool, failure_reason
 
 
 def _submit(spool: Spool, scan_id: str) -> None:
@@ -87,7 +87,7 @@ def test_a_killed_worker_costs_neither_a_try_nor_the_scan(tmp_path: Path) -> Non
 def test_a_scan_that_ends_every_worker_is_given_up(tmp_path: Path) -> None:
     spool = Spool(tmp_path)
     _submit(spool, "a")
-    for _ in range(MOST_DEATHS):
+    for _ in range(MAX_DEATHS):
         claim = spool.claim()
         assert claim is not None
         claim.close()
@@ -164,7 +164,7 @@ def test_only_a_scan_id_is_accepted(tmp_path: Path, name: str) -> None:
     spool = Spool(tmp_path / "spool")
     folder = tmp_path / "spool/tmp/x"
     folder.mkdir()
-    with pytest.raises(SpoolError, match="no scan id"):
+    with pytest.raises(SpoolError, match="not a valid scan id"):
         spool.submit(folder, name)
 
 
@@ -180,7 +180,7 @@ def test_what_is_no_bundle_in_the_queue_stops_nobody(tmp_path: Path) -> None:
 
 
 def test_the_same_scan_in_queue_and_work_is_one(tmp_path: Path) -> None:
-    """Their rename failed for ever, and the worker's thread died of it."""
+    """Their rename kept failing, and the worker's thread died of it."""
     spool = Spool(tmp_path)
     _submit(spool, "a")
     claim = spool.claim()

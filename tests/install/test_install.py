@@ -107,7 +107,7 @@ def test_three_commands_lead_to_the_first_scan(
     machine.put(recordings, RECORDINGS, owner="booth:")
     began_s = time.monotonic()
     setup = machine.run("station", "setup", "--recordings", RECORDINGS)
-    assert "the console's password, shown this once" in setup.stdout
+    assert "the console's password, shown only once" in setup.stdout
     assert "ready: station scan" in setup.stdout
     _scan(machine, "first")
     seconds = installed_s + time.monotonic() - began_s

@@ -70,8 +70,8 @@ def _values(model: BodyModel, vertices: np.ndarray) -> dict[str, float]:
 def test_the_table_names_only_what_the_model_has(model: BodyModel) -> None:
     assert len({definition.name for definition in DEFINITIONS}) == len(DEFINITIONS) >= 60
     for definition in DEFINITIONS:
-        if isinstance(definition.way, Section | Route):
-            assert set(definition.way.parts) <= set(model.part_names)
+        if isinstance(definition.kind, Section | Route):
+            assert set(definition.kind.parts) <= set(model.part_names)
     rows = {sides_pooled(definition.name) for definition in DEFINITIONS} | {"volume", "surface"}
     for models in shipped().values():
         assert rows == set(models)

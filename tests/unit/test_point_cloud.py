@@ -7,8 +7,8 @@ import open3d as o3d
 import pytest
 
 from station.core.errors import InputError
-from workers.cloud import bare
-from workers.cloud.bare import read_cloud
+from workers.cloud import cloud_file
+from workers.cloud.cloud_file import read_cloud
 
 
 def _written(path: Path, points: np.ndarray) -> Path:
@@ -31,7 +31,7 @@ def test_a_large_cloud_is_thinned_the_same_way_each_time(tmp_path: Path) -> None
     points = np.random.default_rng(1).uniform(0.0, 1.0, (260_000, 3))
     path = _written(tmp_path / "large.ply", points)
     first, again = read_cloud(path, "z"), read_cloud(path, "z")
-    assert len(first) == bare._MOST_POINTS
+    assert len(first) == cloud_file._MAX_POINTS
     assert np.array_equal(first.points, again.points)
 
 

@@ -86,7 +86,7 @@ _CAMERA = ("cameras", "front-upper")
         (_set(*_CAMERA, "depth_correction", value={"model": "spline"}), "'spline' is unknown"),
         (_set(*_CAMERA, "distortion", value=[0, 0, 0, 0, None]), "distortion must be"),
         (_set("cameras", value={}), "no camera"),
-        (_set("cameras", value=[1]), "calibrate anew"),
+        (_set("cameras", value=[1]), "calibrate again"),
         (lambda document: document.pop("reference"), "'reference' is missing"),
     ],
 )

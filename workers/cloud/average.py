@@ -14,7 +14,7 @@ _GATE_SIGMAS = 3.0
 """Readings farther from the median than this, plus one disparity step, are left out."""
 _STRAY_READINGS = 2
 """Readings that must be left out before a pixel counts as unsettled."""
-_LEAST_SHARE = 0.4
+_MIN_SHARE = 0.4
 """Share of the frames in which a pixel needs a reading; flickering edges have fewer."""
 _MISSING = np.uint16(65535)
 """Sorts missing readings last."""
@@ -46,7 +46,7 @@ def average(stack: NDArray[np.uint16], scale_m: float) -> AveragedDepth:
     beyond three standard deviations and one disparity step of the median are left out.
     """
     frames = len(stack)
-    least = max(1, int(np.ceil(_LEAST_SHARE * frames)))
+    least = max(1, int(np.ceil(_MIN_SHARE * frames)))
     depth = np.zeros(stack.shape[1:], np.float32)
     count = np.zeros(stack.shape[1:], np.uint16)
     change = np.full(stack.shape[1:], np.nan, np.float32)

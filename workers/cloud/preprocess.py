@@ -30,14 +30,14 @@ _BILATERAL_DIAMETER_PX = 7
 _BILATERAL_RANGE_SIGMAS = 2.5
 """Range parameter, in standard deviations of one reading at the person's distance."""
 _BILATERAL_SPACE_PX = 2.0
-_LEAST_INCIDENCE_COSINE = np.cos(np.radians(76.0))
+_MIN_INCIDENCE_COSINE = np.cos(np.radians(76.0))
 """Readings at a larger angle of incidence are left out."""
 _WINDOW_BORDER_PX = 8
 """Border around the person's part of the image, more than any filter reaches."""
 _VOXEL_M = 0.04
 """Cell size for connected components."""
-_LEAST_READINGS_OF_CELL = 3
-_LEAST_POINTS = 2000
+_MIN_READINGS_PER_CELL = 3
+_MIN_POINTS = 2000
 """Points in the volume below which the booth counts as empty."""
 _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 1.1
@@ -48,7 +48,7 @@ _PEOPLE_STRIDE = 4
 _MOTION_M = 0.010
 """Shift between the first and the last third of the frames from which a scan is repeated."""
 _MOTION_STRIDE = 4
-_LEAST_MOVING = 125
+_MIN_MOVING = 125
 """Every so many points are used for the shift, since neighbours move alike, and at least so many
 are needed."""
 _MOTION_OUTLIER, _MOTION_OUTLIER_M = 3.0, 1e-4
@@ -57,7 +57,7 @@ _MOTION_RIDGE = 1e-2
 """Share of the identity added to the mean of n n^T: directions that no normal shows stay 0."""
 _UNSETTLED_SHARE = 0.25
 """Share of unsettled readings from which a scan is repeated."""
-_LEAST_FRAMES_SHARE = 0.5
+_MIN_FRAMES_SHARE = 0.5
 """Share of the expected frames below which a camera is reported."""
 _PLENTY_OF_FRAMES = 10
 """Frames that are enough, however many others were lost."""
@@ -112,7 +112,7 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         views, clouds = zip(*cleaned, strict=True)
         findings += [finding for of_camera in noticed for finding in of_camera]
     findings += [
-        Finding("camera-blind", name, None, f"camera {name} gave no frame; check it")
+        Finding("camera-blind", name, None, f"camera {name} sent no frame; check its cable")
         for name in bundle.rig.cameras
         if name not in names
     ]
@@ -154,7 +154,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     directions, valid = normals(points, smooth)
     distance = np.sqrt(np.einsum("hwi,hwi->hw", points, points))
     cosine = -np.einsum("hwi,hwi->hw", directions, points) / np.maximum(distance, 1e-6)
-    valid &= near[window] & ~edge & (cosine > _LEAST_INCIDENCE_COSINE)
+    valid &= near[window] & ~edge & (cosine > _MIN_INCIDENCE_COSINE)
     at = np.flatnonzero(valid)
     y, x = np.unravel_index(at, valid.shape)
     readings = averaged.count[window].ravel()[at].astype(np.float64)
@@ -191,7 +191,7 @@ def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -
 def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     """Masks of the points of the largest connected component, and whether others are people."""
     everything = np.concatenate(points)
-    if len(everything) < _LEAST_POINTS:
+    if len(everything) < _MIN_POINTS:
         raise InputError(
             "the booth is empty: the cameras see nobody in its volume; "
             "ask the person to stand on the mark, or check volume in booth.toml"
@@ -203,7 +203,7 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     shape = tuple(cells.max(axis=1) + 3)
     cell = np.ravel_multi_index(tuple(cells), shape)
     occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
-    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= _LEAST_READINGS_OF_CELL))
+    labels, count = ndimage.label(ndimage.binary_dilation(occupied >= _MIN_READINGS_PER_CELL))
     of_point = labels.ravel()[cell]
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
@@ -254,7 +254,7 @@ def _camera_findings(expected: int, name: str, camera: _Camera, keep: Mask) -> l
     if not keep.any():
         message = f"camera {name} sees nothing of the person; check that it is not covered"
         found.append(Finding("camera-blind", name, None, message))
-    if camera.frames < _LEAST_FRAMES_SHARE * expected:
+    if camera.frames < _MIN_FRAMES_SHARE * expected:
         message = f"camera {name} gave {camera.frames} of {expected} frames; check its connection"
         found.append(Finding("frames-missing", name, float(camera.frames), message))
     moved_m = _motion(camera, keep)
@@ -276,7 +276,7 @@ def _motion(camera: _Camera, keep: Mask) -> float:
     Least squares for one shift t that explains the depth changes: n . t = (n . ray) change.
     """
     chosen = np.flatnonzero(keep & np.isfinite(camera.change_m))[::_MOTION_STRIDE]
-    if len(chosen) < _LEAST_MOVING:
+    if len(chosen) < _MIN_MOVING:
         return 0.0
     pose = camera.calibration.world_from_camera
     offsets = camera.points[chosen] - pose[:3, 3]

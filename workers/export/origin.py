@@ -1,4 +1,5 @@
-"""Scan that a result belongs to: what every file of the result says of its order and its booth."""
+"""Scan that a result belongs to: its label, time and booth, as stated in every file of the
+result."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from station.core.bundle import Bundle
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Order, time and booth of a scan; empty where they are not known, as for a file of points."""
+    """Label, time and booth of a scan; empty where they are not known, as for a point cloud
+    file."""
 
     scan_id: str
     label: str = ""

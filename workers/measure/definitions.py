@@ -15,9 +15,9 @@ from workers.measure.kinds import (
     Foremost,
     Leg,
     Level,
+    Perpendicular,
     Route,
     Section,
-    Square,
     Tilted,
     Top,
 )
@@ -83,7 +83,7 @@ def _trunk_girths() -> tuple[Definition, ...]:
             _BODY,
         ),
         Definition(
-            "neck_girth", "just below the larynx, square to the neck", "girth",
+            "neck_girth", "just below the larynx, perpendicular to the neck", "girth",
             Section(
                 Tilted("neck_front", "neck_back", *_both("side_neck")),
                 ("neck", "head", "chest"),
@@ -92,7 +92,7 @@ def _trunk_girths() -> tuple[Definition, ...]:
         ),
         Definition(
             "neck_base_girth",
-            "seventh neck vertebra, side of the neck, pit of the neck and round, over the skin",
+            "seventh neck vertebra, side of the neck, pit of the neck and around, over the skin",
             "girth",
             Route(
                 ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
@@ -140,7 +140,7 @@ def _trunk_girths() -> tuple[Definition, ...]:
             Section(Level(_WAIST, _BUTTOCKS, 0.5), HIPS, whole=True), f"{_CLOTHES} 5.3.12",
         ),
         Definition(
-            "hip_girth", "level, where the buttocks stand out farthest", "large girth",
+            "hip_girth", "level, where the buttocks protrude farthest", "large girth",
             Section(hips, HIPS, whole=True), f"{_CLOTHES} 5.3.13",
         ),
         Definition(
@@ -160,11 +160,11 @@ def _trunk_girths() -> tuple[Definition, ...]:
             Section(waist, TRUNK, whole=True, across=_both("waist_side")),
         ),
         Definition(
-            "hip_breadth", "where the buttocks stand out farthest, from side to side", "breadth",
+            "hip_breadth", "where the buttocks protrude farthest, from side to side", "breadth",
             Section(hips, HIPS, whole=True, across=_both("hip_side")), _BODY,
         ),
         Definition(
-            "hip_depth", "where the buttocks stand out farthest, from front to back", "depth",
+            "hip_depth", "where the buttocks protrude farthest, from front to back", "depth",
             Section(hips, HIPS, whole=True, across=_both("hip_side")),
         ),
     )  # fmt: skip
@@ -233,20 +233,21 @@ def _arm(side: str) -> tuple[Definition, ...]:
         Definition(
             f"upper_arm_girth_{side}",
             "midway from shoulder point to elbow, at least 2 cm below the armpit", "girth",
-            Section(Square(acromion, elbow, 0.5, beyond=f"armpit_{side}"), upper),
+            Section(Perpendicular(acromion, elbow, 0.5, beyond=f"armpit_{side}"), upper),
             f"{_CLOTHES} 5.3.16",
         ),
         Definition(
-            f"elbow_girth_{side}", "at the elbow, square to the line shoulder to wrist", "girth",
-            Section(Square(acromion, wrist, at=elbow), upper), _CLOTHES,
+            f"elbow_girth_{side}", "at the elbow, perpendicular to the line from shoulder to "
+            "wrist", "girth",
+            Section(Perpendicular(acromion, wrist, at=elbow), upper), _CLOTHES,
         ),
         Definition(
             f"forearm_girth_{side}", "a quarter of the way from elbow to wrist", "girth",
-            Section(Square(elbow, wrist, 0.25), lower),
+            Section(Perpendicular(elbow, wrist, 0.25), lower),
         ),
         Definition(
-            f"wrist_girth_{side}", "at the wrist's bone, square to the forearm", "girth",
-            Section(Square(elbow, wrist, 1.0), lower), f"{_CLOTHES} 5.3.19",
+            f"wrist_girth_{side}", "at the wrist bone, perpendicular to the forearm", "girth",
+            Section(Perpendicular(elbow, wrist, 1.0), lower), f"{_CLOTHES} 5.3.19",
         ),
         _distance(f"arm_length_{side}", "shoulder point over elbow to wrist, straight between them",
                   (acromion, elbow, wrist), f"{_CLOTHES} 5.7.8"),
@@ -272,7 +273,7 @@ def _arm(side: str) -> tuple[Definition, ...]:
         ),
         Definition(
             f"armscye_girth_{side}",
-            "shoulder point, both folds of the armpit, below the armpit and round", "girth",
+            "shoulder point, both folds of the armpit, below the armpit and around", "girth",
             Route(
                 (acromion, f"armpit_front_{side}", f"armpit_{side}", f"armpit_back_{side}"),
                 ("tape", "straight", "straight", "tape"),
@@ -288,7 +289,10 @@ def _arm(side: str) -> tuple[Definition, ...]:
             f"hand_girth_{side}",
             "around the hand without the thumb, a quarter of the way from knuckles to wrist",
             "girth",
-            Section(Square(wrist, f"knuckle_{side}", 0.75), (f"hand_{side}", f"fingers_{side}")),
+            Section(
+                Perpendicular(wrist, f"knuckle_{side}", 0.75),
+                (f"hand_{side}", f"fingers_{side}"),
+            ),
             _CLOTHES,
         ),
         Definition(
@@ -334,7 +338,7 @@ def _leg(side: str) -> tuple[Definition, ...]:
             Section(Level((f"calf_{side}",)), shin), f"{_CLOTHES} 5.3.24",
         ),
         Definition(
-            f"ankle_girth_{side}", "level, just above the ankle's bone", "girth",
+            f"ankle_girth_{side}", "level, just above the ankle bone", "girth",
             Section(Level((ankle,), (knee,), 0.09), shin), _CLOTHES,
         ),
         Definition(
@@ -346,7 +350,7 @@ def _leg(side: str) -> tuple[Definition, ...]:
             f"waist_to_hip_length_{side}", "waist to hip at the side, over the skin", "length",
             Route((f"waist_side_{side}", f"hip_side_{side}"), ("tape",), FLANK), _CLOTHES,
         ),
-        _distance(f"lower_leg_length_{side}", "kneecap's middle to the ankle's bone",
+        _distance(f"lower_leg_length_{side}", "middle of the kneecap to the ankle bone",
                   (knee, ankle)),
         _distance(f"foot_length_{side}", "heel to the longest toe", (heel, f"toe_{side}"), _BODY),
         _distance(f"foot_breadth_{side}", "across the ball of the foot",

@@ -1,20 +1,21 @@
 """95 % intervals of measurements, from a calibrated model of their errors.
 
-An ordinary scan of a body of the model's own family errs by an amount that is known for each row.
-To this a scan adds what it shows of itself:
+An ordinary scan of a body of the model's own family has errors of a size that is known for each
+row. To this the scan adds its own uncertainty:
 
     half width = sqrt(constant^2 + (gain sigma)^2 + (1.96 further)^2),
 
 where sigma is the standard deviation of the surface in excess of an ordinary scan's, rms along the
-row's line (`workers.scape.surface.uncertainty`), and `further` is what concerns all of the scan:
-the calibration's own statement of its errors, and a top of the head that nobody saw.
+row's line (`workers.scape.surface.uncertainty`), and `further` is a standard deviation that
+concerns the whole scan: the calibration's own statement of its errors, and a top of the head that
+no camera saw.
 
 `constant` and the row's systematic error `bias` are learned from scans of held-out bodies of the
 family (conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), `gain` from scans of
-sculpted bodies by a sensor that errs otherwise than the fit assumes, so that an interval contains
-the truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval, since a value
-is the length of its line. In the standard pose, which no camera saw, the bias is the mean error of
-re-posing the body, and it is subtracted from the value.
+sculpted bodies by a sensor whose errors differ from those that the fit assumes, so that an interval
+contains the truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval,
+since a value is the length of its line. In the standard pose, which no camera saw, the bias is the
+mean error of re-posing the body, and it is subtracted from the value.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
 _NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval over the standard deviation of a normal distribution."""
-_LEAST_CONSTANT = 0.7
+_MIN_CONSTANT = 0.7
 """Floor of the constant, as a share of what it is without the family's own sigmas: an ordinary scan
 with none of them is no better than that."""
-_LEAST_SIGMA_M = 2e-4
+_MIN_SIGMA_M = 2e-4
 """Floor of the sculpted bodies' standard deviation in a row, for its gain."""
 _OUTLIER = 6.0
 """Median absolute deviations beyond which an error does not count to the spread."""
@@ -90,7 +91,7 @@ class ScanErrors:
         """Standard deviation of a row."""
         if definition.quantity in ("girth", "large girth"):
             return self.girth_sigma_m
-        if isinstance(definition.way, Top):
+        if isinstance(definition.kind, Top):
             return float(np.hypot(self.height_sigma_m, self.crown_sigma_m))
         return self.height_sigma_m
 
@@ -122,13 +123,13 @@ def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
     bias = _shrunk_mean(family.errors)
     ordinary, strange = np.square(family.errors - bias), np.square(unlike.errors - bias)
     beyond = float(np.mean(strange)) - float(np.mean(ordinary))
-    strangeness = max(float(np.mean(unlike.sigmas**2)), _LEAST_SIGMA_M**2)
+    strangeness = max(float(np.mean(unlike.sigmas**2)), _MIN_SIGMA_M**2)
     gain = float(np.sqrt(max(beyond, 0.0) / strangeness))
     gain *= float(stdtrit(len(unlike.errors) - 1, 0.5 + 0.5 * COVERAGE))
     left = np.sqrt(np.maximum(ordinary - np.square(gain * family.sigmas), 0.0))
     constant = max(
         float(np.quantile(left, COVERAGE)),
-        _LEAST_CONSTANT * float(np.quantile(np.sqrt(ordinary), COVERAGE)),
+        _MIN_CONSTANT * float(np.quantile(np.sqrt(ordinary), COVERAGE)),
     )
     return ErrorModel(bias, constant, gain)
 

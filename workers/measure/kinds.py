@@ -11,7 +11,7 @@ from typing import Literal
 Quantity = Literal[
     "large girth", "girth", "height", "length", "distance", "breadth", "depth", "drop"
 ]
-"""Kind of a row; ISO 20685-1 sets its limits by kind."""
+"""Quantity that a row measures; ISO 20685-1 sets its limits by quantity."""
 
 Leg = Literal["skin", "tape", "straight", "floor"]
 """Leg of a route: along the skin; along the skin but taut over hollows, as a tape; straight through
@@ -37,7 +37,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Square:
+class Perpendicular:
     """Plane perpendicular to the line of two landmarks: through `at`, or at a share of the line.
 
     The plane at a share is at least 2 cm beyond the landmark `beyond`, since a tape cannot go
@@ -91,7 +91,7 @@ class Foremost:
         return (*self.upper.named, *self.lower.named, self.front, self.back)
 
 
-Plane = Level | Square | Tilted | Foremost
+Plane = Level | Perpendicular | Tilted | Foremost
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,13 +142,13 @@ class Definition:
     name: str
     words: str
     quantity: Quantity
-    way: Section | Route | Top | Drop
+    kind: Section | Route | Top | Drop
     standard: str = ""
 
     @property
     def landmarks(self) -> tuple[str, ...]:
         """Landmarks that the row depends on."""
-        match self.way:
+        match self.kind:
             case Section(plane, _, _, across):
                 return (*plane.named, *(across or ()))
             case Route(landmarks):

@@ -1,4 +1,4 @@
-"""The standard standing pose, in which bodies are compared and tailors measure.
+"""The standard standing pose, in which bodies are compared and tailors take measurements.
 
 After ISO 20685-1, whose posture for girths of the trunk and limbs is ISO 7250-1's standing posture
 with the arms held 20 degrees off the trunk and the feet apart: upright, head level, legs straight

@@ -16,10 +16,10 @@ from workers.measure.kinds import (
     Drop,
     Foremost,
     Level,
+    Perpendicular,
     Plane,
     Route,
     Section,
-    Square,
     Tilted,
     Top,
 )
@@ -38,7 +38,7 @@ from workers.scape.model.deformation import vertex_normals
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
-"""Distance between a plane and the landmark `Square.beyond`, at the least."""
+"""Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class _Tracer:
         return Trace(definition, value, points, closed, to_floor)
 
     def _follow(self, definition: Definition) -> tuple[float, EdgePoints, bool, bool]:
-        match definition.way:
+        match definition.kind:
             case Section() as section:
                 value, points, closed = self._section(definition, section)
                 return value, points, closed, False
@@ -131,7 +131,7 @@ class _Tracer:
                 if towards:
                     point = point + share * (self._mean(towards) - point)
                 return point, _UP
-            case Square(start, end, share, at, beyond):
+            case Perpendicular(start, end, share, at, beyond):
                 line = self._at(end) - self._at(start)
                 length = float(np.linalg.norm(line))
                 along = share * length

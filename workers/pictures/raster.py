@@ -59,11 +59,11 @@ def nearest_triangles(u, v, depth, shade, faces, height, width):  # type: ignore
 
 @numba.njit(cache=True, nogil=True)
 def blended(nearest, triangle, shown, colors, background):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """The picture (h, w, 3) and its depth (h, w), from what `nearest_triangles` saw.
+    """The picture (h, w, 3) and its depth (h, w), from the output of `nearest_triangles`.
 
     Args:
         colors: (K, 3) of the triangles, or (1, 3) of all of them.
-        background: what a sample that sees nothing shows in each channel.
+        background: value of a sample that no triangle covers, in each channel.
     """
     height, width = nearest.shape[0] // FINER, nearest.shape[1] // FINER
     picture = np.empty((height, width, 3), np.uint8)

@@ -57,12 +57,12 @@ def fit(
       reconstruct fit BUNDLE --out result --debug pictures
     """
     if (bundle is None) == (cloud is None):
-        raise click.UsageError("give a bundle or --cloud FILE: one of them")
+        raise click.UsageError("give either a bundle or --cloud FILE")
     if out_folder.exists():
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
     if debug_folder is not None and debug_folder.exists() and not debug_folder.is_dir():
         raise InputError(f"{debug_folder} is not a folder; name one for the pictures with --debug")
-    from workers.cloud.bare import read_cloud
+    from workers.cloud.cloud_file import read_cloud
     from workers.reconstruct import job
     from workers.scape.fit.observer import Observer, unobserved
     from workers.scape.model.body_model import load_model

@@ -1,8 +1,9 @@
 """A process that warms up, does one job and ends: what it holds or leaks ends with it.
 
-Speaks JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method", "volume"}, reports
-{"step", "share"} and ends with {"status", "reasons"}, {"error"} (the scan cannot be used), {"disk"}
-(the disk refused, the scan is innocent) or {"died"}. Its first argument is the process to end with.
+Communicates by JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method",
+"volume"}, reports {"step", "share"} and ends with {"status", "reasons"}, {"error"} (the scan cannot
+be used), {"disk"} (the disk refused, not the fault of the scan) or {"died"}. Its first argument is
+the process to end with.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ def main() -> None:
     if len(sys.argv) > 1:
         die_with_parent(int(sys.argv[1]))
     set_up_caches()
-    # Ctrl-C on a terminal reaches the whole group; when to end is the pool's to say.
+    # Ctrl-C on a terminal reaches the whole group; the pool decides when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Libraries print to stdout; the pipe to the pool must hear this process alone.
+    # Libraries print to stdout; the pipe to the pool must carry only messages of this process.
     channel = os.dup(1)
     os.dup2(2, 1)
     from workers.reconstruct.job import reconstruct_bundle, warm_up

@@ -19,8 +19,8 @@ _BLANK = "not measured"
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="for programs")
-@click.option("--csv", "as_csv", is_flag=True, help="for spreadsheets")
+@click.option("--json", "as_json", is_flag=True, help="print JSON")
+@click.option("--csv", "as_csv", is_flag=True, help="print CSV")
 @click.option(
     "--pose",
     type=click.Choice(["as-scanned", "standard"]),
@@ -74,7 +74,7 @@ def _of_result(folder: Path, pose: str) -> dict[str, Any]:
 
 
 def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
-    from workers.cloud.bare import read_template_mesh
+    from workers.cloud.cloud_file import read_template_mesh
     from workers.export.origin import Origin
     from workers.export.result import measurements_document
     from workers.measure.body import measure_body, measure_standing

@@ -1,9 +1,9 @@
 """Reconstruction workers: claim a scan, run it in a process of its own, deliver.
 
-Input that cannot be used fails at once with its reason; a job that crashes or hangs is tried again,
-so many times; an end that is none of the job's doing (the station stopped, the disk refused) costs
-no try. The next job's process warms up while the current one works. Nothing that a disk does ends a
-worker: it goes on when the disk does.
+Input that cannot be used fails at once with its reason; a job that crashes or hangs is retried a
+limited number of times; an end that the job did not cause (the station stopped, the disk refused)
+does not count as a try. The next job's process warms up while the current one works. A disk error
+does not end a worker: it continues when the disk works again.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from station.core.config import BoothConfig, find_config, load_config
 from station.core.files import private_folder
 from station.core.scans import ScanId
 from station.core.service import Heartbeat, set_up_logs, stop_event
-from station.core.spool import MOST_DEATHS, Claim, Spool
-from workers.reconstruct.order import JobProcess, Outcome
+from station.core.spool import MAX_DEATHS, Claim, Spool
+from workers.reconstruct.job_handle import JobProcess, Outcome
 
 _POLL_S = 0.05
 _ROUND_S = 0.25
@@ -32,7 +32,7 @@ _SLACK_S = 60.0
 
 
 class Worker:
-    """One thread that works the queue off."""
+    """One thread that processes the queue."""
 
     def __init__(
         self, config: BoothConfig, spool: Spool, stop: threading.Event, log: logging.Logger
@@ -54,10 +54,10 @@ class Worker:
                     worked = self._round()
                     self.problem = ""
                 except OSError as error:
-                    self._trouble(f"the disk refuses ({error})")
+                    self._trouble(f"the disk cannot be used ({error})")
                     continue
                 except Exception as error:
-                    self._log.exception("a worker goes on after an unexpected error")
+                    self._log.exception("a worker continues after an unexpected error")
                     self._trouble(f"{type(error).__name__}: {error}")
                     continue
                 if not worked:
@@ -118,7 +118,7 @@ class Worker:
             raise OSError(outcome.reason)
         if outcome.blame == "station":
             claim.count_death()
-            given_up = claim.note.deaths > MOST_DEATHS
+            given_up = claim.note.deaths > MAX_DEATHS
         else:
             claim.count_try(outcome.reason)
             given_up = claim.tries > self._config.workers.retries
@@ -148,7 +148,7 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
         if not hanging:
             heart.beat()
         if heart.due:
-            heart.tell(
+            heart.report(
                 {
                     "busy": [w.scan_id for w in workers if w.scan_id],
                     "threads": sum(w.thread.is_alive() for w in workers),
@@ -165,10 +165,10 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
 
 
 def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
-    """Look after scans whose worker died; returns what hinders it."""
+    """Recover scans whose worker died; returns a description of any obstacle."""
     try:
         for scan_id in spool.recover(config.workers.retries):
-            log.warning("scan %s is put back: nobody worked on it any more", scan_id)
+            log.warning("scan %s is put back: its worker has died", scan_id)
     except OSError as error:
         return f"the spool cannot be looked through ({error}); check its disk"
     return ""

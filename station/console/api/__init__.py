@@ -1,1 +1,2 @@
-"""The API /api/v1: each request checked, handed to what does it, answered. No logic of its own."""
+"""The API /api/v1: checks each request, passes it on, and answers it. It has no logic of its
+own."""

@@ -121,21 +121,22 @@ def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
 
 @router.post("/booth/start", responses=responses(409), tags=["booth"])
 def start(console: Booth, caller: Scanner) -> Streaming:  # noqa: ARG001
-    """Sensors on; the cameras' states tell when each gives frames."""
+    """Sensors on; the cameras' states show when each sends frames."""
     command(console.config, ControlRequest("start"))
     return Streaming(streaming=True)
 
 
 @router.post("/booth/stop", responses=responses(409), tags=["booth"])
 def stop(console: Booth, caller: Scanner) -> Streaming:  # noqa: ARG001
-    """Sensors off; scans that were accepted go on."""
+    """Sensors off; accepted scans are still reconstructed."""
     command(console.config, ControlRequest("stop"))
     return Streaming(streaming=False)
 
 
 @router.post("/booth/check", status_code=202, responses=responses(409), tags=["booth"])
 def check(console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Task:
-    """Compare the empty booth with its calibration: begins, `/task` tells how it goes."""
+    """Compare the empty booth with its calibration: starts the check, whose progress is at
+    `/task`."""
     if _first(console, caller, key, "check"):
         console.tasks.check()
     return Task(**console.tasks.state())
@@ -143,25 +144,25 @@ def check(console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Task:
 
 @router.get("/task", responses=responses(), tags=["calibration"])
 def task(console: Booth, caller: Reader) -> Task:  # noqa: ARG001
-    """The calibration step or check that runs, or the last one that did."""
+    """The current calibration step or check, or the last one."""
     return Task(**console.tasks.state())
 
 
 @router.delete("/task", responses=responses(), tags=["calibration"])
 def stop_task(console: Booth, caller: Manager) -> Task:  # noqa: ARG001
-    """Stop what runs; what was seen is kept."""
+    """Stop the current task; recorded data are kept."""
     return Task(**console.tasks.stop())
 
 
 @router.post("/task/answer", responses=responses(409), tags=["calibration"])
 def answer(body: Answer, console: Booth, caller: Manager) -> Task:  # noqa: ARG001
-    """Say "go", "yes" or "no" to what waits."""
+    """Answer "go", "yes" or "no" to the waiting task."""
     return Task(**console.tasks.answer(body.answer))
 
 
 @router.post("/calibration", status_code=202, responses=responses(409), tags=["calibration"])
 def calibrate(body: NewStep, console: Booth, caller: Manager, key: IdempotencyKey = None) -> Task:
-    """Begin a step of the calibration, or all that are not done."""
+    """Start a step of the calibration, or all remaining steps."""
     if _first(console, caller, key, body.model_dump_json()):
         console.audit.note(caller.name, caller.address, f"calibrate {body.step}")
         console.tasks.calibrate(body.step, body.new)
@@ -169,7 +170,7 @@ def calibrate(body: NewStep, console: Booth, caller: Manager, key: IdempotencyKe
 
 
 def _first(console: Console, caller: Caller, key: str | None, request: str) -> bool:
-    """Whether a key has not begun this before."""
+    """Whether an idempotency key is new for this request."""
     mark = f"{time.time_ns()}"
     return once(console, caller, key, request, mark) == mark
 
@@ -194,7 +195,8 @@ def use(name: str, console: Booth, caller: Manager) -> Calibration:
     tags=["calibration"],
 )
 def compare(first: str, second: str, console: Booth, caller: Reader) -> list[CameraShift]:  # noqa: ARG001
-    """Shift and turn of each camera between two calibrations, seen by the reference."""
+    """Shift and rotation of each camera between two calibrations, relative to the reference
+    camera."""
     before, after = _known(console, first).rig, _known(console, second).rig
     shifts = []
     for name in before.cameras.keys() & after.cameras.keys():

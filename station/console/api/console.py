@@ -1,4 +1,4 @@
-"""Everything that requests share, and who sends them."""
+"""State shared by all requests, and their senders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.console.api.problems import ProblemError
 from station.console.live.cameras import Pictures
-from station.console.live.desk import Desk
+from station.console.live.countdown import ScanCountdown
 from station.console.live.events import EventLog
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
@@ -46,7 +46,7 @@ class Console:
     events: EventLog = field(init=False)
     watch: Watch = field(init=False)
     pictures: Pictures = field(init=False)
-    desk: Desk = field(init=False)
+    countdown: ScanCountdown = field(init=False)
     tasks: Tasks = field(init=False)
     throttle: LoginThrottle = field(init=False)
     heart: Heartbeat = field(init=False)
@@ -59,7 +59,7 @@ class Console:
         self.index, self.events = ScanIndex(self.spool), EventLog()
         self.watch = Watch(self.config, self.events, self.log)
         self.pictures = Pictures(self.config, self.log)
-        self.desk = Desk(self.config, self.events)
+        self.countdown = ScanCountdown(self.config, self.events)
         self.tasks = Tasks(self.config_path, folder, self.events)
         self.throttle = LoginThrottle()
         self.heart = Heartbeat(self.config.runtime.folder, "console")
@@ -122,7 +122,7 @@ def caller_of(connection: HTTPConnection) -> Caller:
     """The sender of a request, or of a WebSocket.
 
     Raises:
-        ProblemError: 401, nobody who is known.
+        ProblemError: 401, the sender is unknown.
     """
     vault = console_of(connection).vault
     address = connection.client.host if connection.client else "?"
@@ -145,7 +145,7 @@ def _unknown(detail: str) -> ProblemError:
 
 
 def need(scope: Scope) -> Callable[[HTTPConnection], Caller]:
-    """A dependency: the caller, who has a scope."""
+    """Dependency that yields the caller if it has a scope."""
 
     def check(connection: HTTPConnection) -> Caller:
         caller = caller_of(connection)
@@ -171,13 +171,13 @@ IdempotencyKey = Annotated[
     Header(
         alias="Idempotency-Key",
         pattern=r"^[\x20-\x7e]{1,200}$",
-        description="the same key never begins the same thing twice",
+        description="a request with the same key is carried out only once",
     ),
 ]
 
 
 def once(console: Console, caller: Caller, key: str | None, request: str, answer: str) -> str:
-    """The answer that a key stands for: `answer` if it is new, else that of the first time.
+    """The answer recorded for a key: `answer` if the key is new, else the first answer.
 
     Raises:
         ProblemError: 422, the key was used for another request.

@@ -16,9 +16,9 @@ from station.console.api.problems import ProblemError, responses
 
 router = APIRouter(tags=["live"])
 _RECHECK_S = 10.0
-"""A viewer whose session ended or whose token was revoked is sent away within this time."""
+"""A viewer whose session ended or whose token was revoked is disconnected within this time."""
 _PATIENCE_S = 60.0
-"""A viewer that takes no picture for so long is gone."""
+"""A viewer that takes no picture for this long is disconnected."""
 
 
 @router.get(
@@ -38,9 +38,9 @@ async def events(
     console: Booth,
     caller: Reader,  # noqa: ARG001
     last_event_id: Annotated[str, Header(max_length=60)] = "",
-    follow: Annotated[bool, Query(description="false: what there is, then the end")] = True,
+    follow: Annotated[bool, Query(description="false: existing events only")] = True,
 ) -> StreamingResponse:
-    """Events as they happen. With Last-Event-ID a program goes on where it stopped."""
+    """Events as they happen. With Last-Event-ID a program resumes where it stopped."""
     stream = _while_allowed(request, console, console.events.stream(last_event_id, follow))
     return StreamingResponse(stream, media_type="text/event-stream")
 

@@ -23,7 +23,7 @@ class Login(_Strict):
 
 
 class Session(BaseModel):
-    """The session, and how the page shows things."""
+    """The session, and display settings of the page."""
 
     logged_in: bool
     password_set: bool
@@ -79,7 +79,7 @@ class BoothState(BaseModel):
 
 
 class Streaming(BaseModel):
-    """Whether the sensors are wanted on."""
+    """Whether the sensors should be on."""
 
     streaming: bool
 
@@ -92,7 +92,7 @@ class NewScan(_Strict):
 
 
 class Scan(BaseModel):
-    """One scan, from the word to the result."""
+    """One scan, from the command to the result."""
 
     scan_id: str
     label: str
@@ -103,7 +103,7 @@ class Scan(BaseModel):
     reasons: list[str]
     created: str = Field(description="ISO 8601, UTC")
     finished: str
-    seconds: dict[str, float] = Field(description="what each step of the reconstruction took")
+    seconds: dict[str, float] = Field(description="duration of each step of the reconstruction")
     framesets: int
     wanted: int
 
@@ -163,11 +163,11 @@ class Part(BaseModel):
     name: str
     coverage: float
     residual_rms_m: float | None
-    doubtful: bool = Field(description="the verdict's reasons name it")
+    doubtful: bool = Field(description="whether the verdict's reasons name it")
 
 
 class Quality(BaseModel):
-    """Why a result can be trusted, or not."""
+    """Quality of a result: verdict, reasons and coverage."""
 
     verdict: str
     reasons: list[str]
@@ -183,12 +183,12 @@ class ComparedRow(BaseModel):
     first: float
     second: float
     difference: float
-    uncertainty: float = Field(description="what both 95 % intervals explain together")
+    uncertainty: float = Field(description="largest difference that both 95 % intervals explain")
     real: bool = Field(description="the difference exceeds that")
 
 
 class Comparison(BaseModel):
-    """Two scans; surfaces as they stood, the second laid over the first as a rigid whole."""
+    """Comparison of two scans; surfaces as scanned, the second rigidly aligned to the first."""
 
     first: Scan
     second: Scan
@@ -211,7 +211,7 @@ class Calibration(BaseModel):
 
 
 class CameraShift(BaseModel):
-    """Shift and turn of a camera from one calibration to another."""
+    """Shift and rotation of a camera from one calibration to another."""
 
     camera: str
     shift_mm: float
@@ -222,7 +222,7 @@ class NewStep(_Strict):
     """A step of the calibration."""
 
     step: Literal["all", "floor", "ball", "mark", "front", "around", "depth", "solve"] = "all"
-    new: bool = Field(default=False, description="begin anew; what was seen is set aside")
+    new: bool = Field(default=False, description="start over; recorded data are set aside")
 
 
 class Answer(_Strict):
@@ -232,7 +232,7 @@ class Answer(_Strict):
 
 
 class Task(BaseModel):
-    """A calibration step or a check: what it says and what it waits for."""
+    """A calibration step or a check: its messages and the answer that it is waiting for."""
 
     kind: str
     step: str

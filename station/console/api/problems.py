@@ -1,4 +1,4 @@
-"""Errors as problem documents (RFC 9457), with the words and remedies of the commands."""
+"""Errors as problem documents (RFC 9457), with the messages and remedies of the commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Problem(BaseModel):
     type: str = Field(description="/problems/<kind>; stays the same over releases")
     title: str
     status: int
-    detail: str = Field(description="what is wrong and what to do, as the commands say it")
+    detail: str = Field(description="problem and remedy, in the words of the commands")
 
 
 class ProblemError(Exception):
@@ -40,22 +40,22 @@ _MEANINGS = {
     400: "The range cannot be read",
     401: "Log in, or give a valid token",
     403: "Not within the token's scopes, or sent by another site",
-    404: "No such thing here",
+    404: "Not found",
     408: "The request came too slowly",
     409: "The station refuses; the detail says why and what to do",
     413: "The body is too large",
     416: "The range lies outside the file",
-    421: "The console does not go by this name",
-    422: "A value is missing or impossible",
+    421: "The console is not known by this host name",
+    422: "A value is missing or invalid",
     429: "Too many wrong passwords; Retry-After says how long to wait",
     431: "The headers are too large",
-    503: "No station answers",
+    503: "No station is responding",
 }
 _ALWAYS = (401, 403, 408, 413, 421, 422, 431, 503)
 
 
 def responses(*more: int) -> dict[int | str, dict[str, Any]]:
-    """Answers of a route beside its result, for the OpenAPI document."""
+    """Error answers of a route, for the OpenAPI document."""
     schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
     found: dict[int | str, dict[str, Any]] = {
         status: {"description": _MEANINGS[status], "content": {MEDIA_TYPE: schema}}

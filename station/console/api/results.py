@@ -92,7 +92,7 @@ def file(
 
 @router.get("/quality", responses=responses(404))
 def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
-    """Coverage of each part of the body, and which one the verdict doubts."""
+    """Coverage of each part of the body, and whether the verdict doubts it."""
     record, folder = _open(console, caller, scan_id, "quality")
     parts = _result(folder).get("quality", {}).get("parts", {})
     reasons = " ".join(record.reasons)
@@ -230,7 +230,7 @@ def comparison(
     unit: UnitQuery = "cm",
     language: LanguageQuery = "en",
 ) -> Comparison:
-    """The other scan less this one: each measurement, and the surfaces."""
+    """Difference of the other scan from this one: each measurement, and the surfaces."""
     record, folder = _open(console, caller, scan_id, "comparison")
     second, other_folder = _open(console, caller, other, "comparison")
     surfaces = compare_surfaces(folder, other_folder)

@@ -28,7 +28,7 @@ from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
 _ON_DISK = ("accepted", "reconstructing", "delivered", "rescan")
-_MOST_OF_A_LABEL = 1000
+_MAX_LABEL_LENGTH = 1000
 
 
 @router.get("", responses=responses())
@@ -69,11 +69,11 @@ def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = N
     fresh = f"{stamp}-{secrets.token_hex(2)}"
     scan_id = once(console, caller, key, body.model_dump_json(), fresh)
     if scan_id != fresh:
-        # Begun before: a finished scan is not begun again even if the station forgot it.
+        # Repeated request: a finished scan is not taken again even if the station has forgotten it.
         with suppress(ProblemError):
             return _state(console, scan_id)
     console.audit.note(caller.name, caller.address, "scan", scan_id)
-    session = console.desk.begin(scan_id, body.label, body.countdown_s)
+    session = console.countdown.begin(scan_id, body.label, body.countdown_s)
     return _of_session(session)
 
 
@@ -84,7 +84,7 @@ def state(scan_id: ScanId, console: Booth, caller: Reader) -> Scan:  # noqa: ARG
 
 
 def _state(console: Console, scan_id: str) -> Scan:
-    waiting = console.desk.status(scan_id)
+    waiting = console.countdown.status(scan_id)
     if waiting is not None:
         return _of_session(waiting)
     record = console.index.get(scan_id)
@@ -98,22 +98,22 @@ def _state(console: Console, scan_id: str) -> Scan:
         raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
     if found.state not in _ON_DISK:
         return found
-    # On disk by now, or deleted: the station remembers what it did, the folders what there is.
+    # On disk by now, or deleted: the folders take precedence over the station's memory.
     return of_record(console.record(scan_id))
 
 
 @router.post("/{scan_id}/cancel", responses=responses(404, 409))
 def cancel(scan_id: ScanId, console: Booth, caller: Scanner) -> Scan:
-    """Give up a scan that is being taken or waits for its reconstruction."""
+    """Cancel a scan that is being taken or is waiting to be reconstructed."""
     _state(console, scan_id)
     console.audit.note(caller.name, caller.address, "cancel", scan_id)
-    console.desk.cancel(scan_id)
+    console.countdown.cancel(scan_id)
     return _state(console, scan_id)
 
 
 @router.delete("/{scan_id}", responses=responses(404, 409))
 def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
-    """Delete a scan, its bundle and its results, for good."""
+    """Delete a scan, its bundle and its results permanently."""
     console.record(scan_id)
     console.audit.note(caller.name, caller.address, "delete", scan_id)
     purge_scan(console.spool, scan_id)
@@ -127,7 +127,7 @@ def delete_label(
     caller: Manager,
 ) -> Removed:
     """Delete all scans with exactly this label."""
-    found = console.index.find(label=label, limit=_MOST_OF_A_LABEL)
+    found = console.index.find(label=label, limit=_MAX_LABEL_LENGTH)
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
     for record in found:
@@ -155,7 +155,7 @@ def of_record(record: ScanRecord) -> Scan:
 
 
 def _of_session(session: dict[str, Any]) -> Scan:
-    """A scan that the station, or its countdown, tells of."""
+    """A scan known to the station, or in its countdown."""
     state = session["state"]
     return Scan(
         scan_id=session["scan_id"],

@@ -1,4 +1,4 @@
-"""The cameras' newest depth pictures, drawn only while somebody waits for one."""
+"""The cameras' newest depth pictures, drawn only while somebody is waiting for one."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from station.messaging.messages import FrameHeader
 from station.messaging.transport import subscriber
 
 _IDLE_S = 2.0
-"""Without a viewer for so long the frames are no longer received at all."""
+"""Time without a viewer after which frames are no longer received."""
 _FORGET_S = 1.5
-"""An older picture says nothing of what the camera sees now."""
+"""Age beyond which a picture is not shown."""
 
 
 class Pictures:
-    """One thread for any number of viewers. A viewer that does not ask costs nothing."""
+    """One thread for any number of viewers. A viewer that requests nothing costs nothing."""
 
     def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
         self._config, self._log = config, log
@@ -73,7 +73,7 @@ class Pictures:
         context.destroy(linger=0)
 
     def _serve(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        """Receive until nobody has asked for a while."""
+        """Receive until nobody has requested a picture for a while."""
         names = [f"camera-{name}" for name in self._names]
         frames = subscriber(context, self._config.runtime.folder, names, ["depth"])
         newest: dict[str, list[zmq.Frame]] = {}

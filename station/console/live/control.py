@@ -11,18 +11,18 @@ from station.messaging.transport import ask
 
 
 class NotRunningError(BoothError):
-    """No station answers."""
+    """No station is responding."""
 
 
 class RefusedError(BoothError):
-    """The station answers, and refuses."""
+    """The station responds, and refuses."""
 
 
 def command(config: BoothConfig, request: Request) -> dict[str, Any]:
     """The reply of the control process.
 
     Raises:
-        NotRunningError: nobody does.
+        NotRunningError: no station responds.
         RefusedError: it refuses; the message says why and what to do.
     """
     try:

@@ -1,8 +1,8 @@
-"""Numbered events: a program that lost its connection goes on where it stopped.
+"""Numbered events: a program that lost its connection resumes where it stopped.
 
-An id is `<start>-<number>`; `<start>` is another one after each start of the console. A reader that
-asks for what this log no longer holds gets the event `reset` first: read everything anew.
-A slow reader has a cursor far behind and costs nothing else.
+An id is `<start>-<number>`; `<start>` differs after each start of the console. A reader that asks
+for events that this log no longer holds gets the event `reset` first and has to read everything
+again. A slow reader only has a cursor that lags behind.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class EventLog:
         self._news = asyncio.Event()
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Readers wait in this loop."""
+        """Set the loop in which readers wait."""
         self._loop = loop
 
     def append(self, kind: Kind, data: dict[str, Any]) -> None:
-        """From any thread."""
+        """Append an event; may be called from any thread."""
         now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         text = json.dumps({"time": now, **data}, ensure_ascii=False, allow_nan=False)
         with self._lock:
@@ -69,7 +69,7 @@ class EventLog:
             return [event for event in self._events if event.number > number]
 
     def _resume(self, last_id: str) -> tuple[int, bool]:
-        """The number to go on after, and whether something in between is lost."""
+        """The number to resume after, and whether events in between are lost."""
         with self._lock:
             oldest = self._events[0].number if self._events else self._number + 1
             start, _, number = last_id.partition("-")
@@ -89,7 +89,7 @@ class EventLog:
             news = self._news
             found = self.after(number)
             if found and found[0].number > number + 1 and number:
-                # The reader slept through more than is kept.
+                # The reader missed more events than are kept.
                 yield self._packed(Event(found[0].number - 1, "reset", "{}"))
             for event in found:
                 number = event.number

@@ -1,5 +1,5 @@
-"""A calibration that is led from the page: `station calibrate` in a process of its own, its guide's
-words as JSON lines, the operator's answers as lines back."""
+"""A calibration guided from the page: `station calibrate` in a process of its own, which writes its
+messages as JSON lines and reads the operator's answers as lines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PROGRESS_S = 0.2
 
 @dataclass(slots=True)
 class PageGuide(Guide):
-    """A guide whose terminal is the page."""
+    """A guide that uses the page as its terminal."""
 
     _last_s: float = 0.0
 
@@ -68,11 +68,11 @@ class PageGuide(Guide):
         return self._answer() == "yes"
 
     def end_line(self) -> None:
-        """The page has no line that is written over."""
+        """Do nothing: the page has no line that is overwritten."""
 
 
 def run(config_path: Path, step: str, new: bool) -> None:
-    """One step, or all that are not done.
+    """Run one step, or all remaining steps.
 
     Raises:
         BoothError: as `station calibrate` does.

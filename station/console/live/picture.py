@@ -1,5 +1,5 @@
-"""A depth image as an operator reads it: distance in colours, the person's outline, and what is out
-of the volume in grey. Pure."""
+"""A depth image for the operator: distance in colours, the person's outline, and everything outside
+the volume in grey. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from station.core.rig import CameraCalibration
 STRIDE_PX = 2
 _NEAR_M, _FAR_M = 1.0, 3.4
 _FLOOR_M = 0.05
-"""Lower than this a person's outline runs into the floor's noise."""
+"""Height below which a person's outline merges with the floor's noise."""
 _SMALLEST_PERSON_PX = 400
 _JPEG_QUALITY = 78
 _OUTLINE = (255, 255, 255)
@@ -22,7 +22,7 @@ _BACKDROP = (46, 36, 30)
 
 
 class PictureMaker:
-    """One camera's pictures; what a pixel looks at is computed once."""
+    """One camera's pictures; the rays of its pixels are computed once."""
 
     def __init__(self, camera: CameraCalibration | None, volume: Volume) -> None:
         """``camera``: None before the booth is calibrated: then everything is coloured."""

@@ -24,7 +24,7 @@ CHECK_FILE = "last-check.json"
 
 
 class Tasks:
-    """The task that runs, or the last one that did."""
+    """The current task, or the last one."""
 
     def __init__(self, config_path: Path, folder: Path, events: EventLog) -> None:
         self._config_path, self._folder, self._events = config_path, folder, events
@@ -33,7 +33,7 @@ class Tasks:
         self._state = _idle()
 
     def state(self) -> dict[str, Any]:
-        """The running task, its words, the answer that it waits for."""
+        """The current task, its messages, the answer that it is waiting for."""
         with self._lock:
             return {**self._state, "lines": list(self._state["lines"])}
 
@@ -46,10 +46,10 @@ class Tasks:
         return document if isinstance(document, dict) else None
 
     def calibrate(self, step: str, new: bool) -> dict[str, Any]:
-        """Begin a step of the calibration, or all.
+        """Start a step of the calibration, or all.
 
         Raises:
-            RefusedError: something else is at work.
+            RefusedError: another task is running.
         """
         module = [sys.executable, "-m", "station.console.live.guided"]
         words = [str(self._config_path), step, *(["new"] if new else [])]
@@ -59,7 +59,7 @@ class Tasks:
         """Compare the empty booth with what was stored when it was calibrated.
 
         Raises:
-            RefusedError: something else is at work.
+            RefusedError: another task is running.
         """
         option = ["--config", str(self._config_path)]
         return self._begin(
@@ -70,19 +70,19 @@ class Tasks:
         """Pass on the operator's answer to the running task: "go", "yes" or "no".
 
         Raises:
-            RefusedError: it waits for nothing.
+            RefusedError: it is not waiting for an answer.
         """
         with self._lock:
             process = self._process
             if process is None or process.stdin is None or not self._state["waits_for"]:
-                raise RefusedError("nothing waits for an answer")
+                raise RefusedError("nothing is waiting for an answer")
             self._state["waits_for"] = ""
             process.stdin.write(f"{word}\n")
             process.stdin.flush()
         return self.state()
 
     def stop(self) -> dict[str, Any]:
-        """End the running task as Ctrl-C does; what was seen is kept."""
+        """End the running task as Ctrl-C does; recorded data are kept."""
         with self._lock:
             if self._process is not None:
                 self._process.send_signal(signal.SIGINT)
@@ -96,7 +96,7 @@ class Tasks:
     def _begin(self, kind: str, step: str, command: list[str]) -> dict[str, Any]:
         with self._lock:
             if self._process is not None:
-                raise RefusedError(f"{self._state['kind']} is at work; wait, or stop it")
+                raise RefusedError(f"{self._state['kind']} is in progress; wait for it, or stop it")
             self._state = {**_idle(), "kind": kind, "step": step, "running": True}
             self._process = subprocess.Popen(
                 command,
@@ -122,7 +122,7 @@ class Tasks:
             if isinstance(said, list):
                 self._keep_check(said)
             elif isinstance(said, dict):
-                self._hear(said)
+                self._handle(said)
         words = process.stderr.read().strip().splitlines()
         code = process.wait()
         with self._lock:
@@ -132,7 +132,7 @@ class Tasks:
             self._state |= {"running": False, "waits_for": "", "countdown_s": None}
         self._tell()
 
-    def _hear(self, said: dict[str, Any]) -> None:
+    def _handle(self, said: dict[str, Any]) -> None:
         """One line of the guide."""
         text = str(said.get("text", ""))
         with self._lock:

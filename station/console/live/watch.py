@@ -1,4 +1,4 @@
-"""Watches the booth: cameras, framesets, scans, the spool; and tells the event log what changed."""
+"""Watches cameras, framesets, scans and the spool, and writes changes to the event log."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _POLL_MS = 50
 _SPOOL_S = 0.1
 _STATUS_S = 1.0
 _SILENT_S = 1.3
-"""Health comes twice a second; two that are missing say that the capture process is gone."""
+"""Health is sent twice a second; two missing reports mean that the capture process is gone."""
 _HANGS_S = 2.0
-"""A round takes milliseconds; the supervisor waits for longer before it acts."""
+"""A round takes milliseconds; the supervisor waits longer before it acts."""
 _RECENT = 200
 
 
@@ -38,7 +38,7 @@ class CameraState:
     name: str
     state: str = "off"
     """"off", "opening", "streaming", "lost" or "dead"."""
-    detail: str = "its capture process has not been heard of yet"
+    detail: str = "its capture process has not reported yet"
     frames: int = 0
     lost: int = 0
     heard_s: float = field(default_factory=time.monotonic)
@@ -49,7 +49,7 @@ class CameraState:
 
 
 class Watch:
-    """One thread; what it knows may be read from any."""
+    """Runs in one thread; its state may be read from any."""
 
     def __init__(self, config: BoothConfig, events: EventLog, log: logging.Logger) -> None:
         self._config, self._events, self._log = config, events, log
@@ -79,15 +79,15 @@ class Watch:
             thread.join(5.0)
 
     def hangs(self) -> bool:
-        """Whether the booth is not watched any more, although its thread should run."""
+        """Whether the watching thread has stopped making progress."""
         return time.monotonic() - self._round_s > _HANGS_S
 
     def health(self) -> dict[str, Any]:
-        """The console's word about itself for `station status`."""
+        """Health report of the console for `station status`."""
         return {"problems": [f"console: {self._problem}"] if self._problem else []}
 
     def booth(self) -> dict[str, Any]:
-        """Everything of the booth's state that is known now."""
+        """The booth's state as far as it is known now."""
         spool = self._status.get("spool", {})
         usage = shutil.disk_usage(self._config.spool.folder)
         return {
@@ -110,7 +110,7 @@ class Watch:
             self._round_s = time.monotonic()
             try:
                 if incoming.poll(_POLL_MS):
-                    self._hear(*incoming.recv_multipart())
+                    self._receive(*incoming.recv_multipart())
                 now_s = time.monotonic()
                 if now_s - looked_s > _SPOOL_S:
                     looked_s = now_s
@@ -119,11 +119,11 @@ class Watch:
                     self._problem = ""
             except (BoothError, OSError, zmq.ZMQError) as error:
                 self._log.warning("watching the booth: %s", error)
-                self._problem = f"the booth cannot be watched ({error}); it is tried again"
+                self._problem = f"the booth cannot be watched ({error}); retrying"
                 self._stop.wait(1.0)
         context.destroy(linger=0)
 
-    def _hear(self, topic: bytes, packed: bytes) -> None:
+    def _receive(self, topic: bytes, packed: bytes) -> None:
         if topic == b"scan":
             event = ScanEvent.unpack(packed)
             self._events.append(
@@ -148,8 +148,8 @@ class Watch:
             if camera.state != "dead" and now_s - camera.heard_s > _SILENT_S:
                 camera.state = "dead"
                 camera.detail = (
-                    "its capture process does not answer; it is started again by itself; if this "
-                    "stays, unplug the camera's USB for five seconds"
+                    "its capture process is not responding and is restarted automatically; if "
+                    "this persists, unplug the camera's USB cable for five seconds"
                 )
                 self._events.append("camera", camera.document())
 

@@ -1,3 +1,3 @@
-"""Access to the console: password, sessions, tokens, origins of requests, the log of it.
-Nothing here knows what a request is for.
+"""Access to the console: password, sessions, tokens, origins of requests, and the log of it.
+Nothing here depends on the content of a request.
 """

@@ -1,4 +1,4 @@
-"""A log of who took, read or deleted which body, without any body data in it.
+"""A log of who took, read or deleted which scan, without any body data.
 
 One JSON object a line: time, who (operator, or a token's name), from where, what, which scan.
 No label, no measurement, no file content.

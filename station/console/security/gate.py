@@ -15,7 +15,7 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Message, Receive, Send], Awaitable[None]]
 
 LARGEST_BODY_BYTES = 64 << 10
-"""Labels and passwords are all that is ever sent here."""
+"""Only labels and passwords are ever sent here."""
 LARGEST_HEAD_BYTES = 16 << 10
 SLOWEST_BODY_S = 10.0
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -97,19 +97,20 @@ class Gate:
         if scope["type"] == "websocket" and origin is None and "authorization" not in headers:
             return 403, "cross-site", "a WebSocket needs an Origin, or a token"
         if sum(len(name) + len(value) for name, value in scope["headers"]) > LARGEST_HEAD_BYTES:
-            return 431, "head-too-large", f"at most {LARGEST_HEAD_BYTES} bytes of headers are taken"
+            return 431, *_HEAD_TOO_LARGE
         length = headers.get("content-length", "0")
         if not length.isascii() or not length.isdigit() or int(length) > LARGEST_BODY_BYTES:
             return 413, *_TOO_LARGE
         return None
 
 
-_TOO_LARGE = ("too-large", f"at most {LARGEST_BODY_BYTES} bytes are taken")
+_HEAD_TOO_LARGE = ("head-too-large", f"at most {LARGEST_HEAD_BYTES} bytes of headers are accepted")
+_TOO_LARGE = ("too-large", f"at most {LARGEST_BODY_BYTES} bytes are accepted")
 _TOO_SLOW = ("too-slow", f"the request did not arrive within {SLOWEST_BODY_S:g} s")
 
 
 async def _whole_body(receive: Receive) -> bytes | None:
-    """A request's body, which is small; None if it is too large.
+    """The body of a request; None if it is too large.
 
     Raises:
         TimeoutError: it did not come in time.

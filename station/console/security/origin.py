@@ -2,7 +2,7 @@
 
 A page of another site may send requests here with the operator's cookie (cross-site request
 forgery), and a site whose name is made to point at this address may read the answers (DNS
-rebinding). The first is told by its Origin, the second by its Host.
+rebinding). The first is recognised by its Origin header, the second by its Host header.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ def own_names(names: Collection[str]) -> frozenset[str]:
 
 
 def host_allowed(host: str, names: Collection[str]) -> bool:
-    """Whether a Host header is one of ours; an address needs no name service, so it is safe."""
+    """Whether a Host header is one of the console's; a numeric address does not depend on a name
+    service, so it is safe."""
     name = _hostname(f"//{host}")
     if name is None:
         return False
@@ -32,7 +33,7 @@ def host_allowed(host: str, names: Collection[str]) -> bool:
 
 
 def same_origin(origin: str, host: str, scheme: str) -> bool:
-    """Whether an Origin header names the very address that the request was sent to."""
+    """Whether an Origin header names the address that the request was sent to."""
     try:
         parts = urlsplit(origin)
         return parts.scheme == scheme and parts.netloc.lower() == host.lower() and bool(host)

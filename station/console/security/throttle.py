@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import OrderedDict
 
 FREE_TRIES = 5
-"""A person mistypes; a program tries thousands."""
+"""Tries without a pause: a person mistypes, a program tries thousands."""
 LONGEST_PAUSE_S = 60.0
 _ADDRESSES_KEPT = 1000
 
 
 class LoginThrottle:
-    """Growing pauses for an address that gives wrong passwords; and for all of them together."""
+    """Growing pauses for an address that sends wrong passwords, and for all addresses together."""
 
     def __init__(self) -> None:
         self._failures: OrderedDict[str, tuple[int, float]] = OrderedDict()
-        """Address -> how often in a row, and when last, seconds."""
+        """Address -> number of failures in a row, and the time of the last one in seconds."""
 
     def wait_s(self, address: str, now_s: float) -> float:
         """Seconds that this address has to wait before its next try; 0 if it need not."""

@@ -1,4 +1,5 @@
-"""The console's memory across restarts: sessions, tokens and keys, never in clear.
+"""Persistent credentials of the console: password, sessions, tokens and idempotency keys, stored as
+hashes.
 
 A session's or token's secret is 256 random bits, so one SHA-256 hides it well; the password is a
 person's, so it is hashed with argon2id (RFC 9106) in a file of its own.
@@ -42,7 +43,7 @@ CREATE TABLE IF NOT EXISTS keys (
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A program's way in."""
+    """An access token of a program."""
 
     name: str
     scopes: tuple[Scope, ...]
@@ -92,7 +93,7 @@ class Vault:
         self._run("DELETE FROM sessions")
 
     def check_password(self, password: str) -> bool:
-        """Whether it is the operator's; takes tens of milliseconds whatever the answer."""
+        """Whether it is the operator's; takes tens of milliseconds in either case."""
         try:
             stored = (self._folder / PASSWORD).read_text()
             return self._hasher.verify(stored, password)
@@ -139,7 +140,7 @@ class Vault:
         return [_token(row) for row in rows]
 
     def revoke_token(self, name: str) -> None:
-        """Make a token worthless, at once.
+        """Revoke a token, with immediate effect.
 
         Raises:
             BoothError: there is none of that name.
@@ -159,10 +160,10 @@ class Vault:
         return _token(rows[0]) if rows else None
 
     def remember(self, key: str, request: str, answer: str) -> tuple[str, str]:
-        """Tie an idempotency key to what it began; what it was tied to first stays.
+        """Record the answer for an idempotency key, unless it has one.
 
         Returns:
-            (request, answer) that the key stands for.
+            (request, answer) recorded for the key.
         """
         now = time.time()
         self._run("DELETE FROM keys WHERE made < ?", now - _KEYS_KEPT_S)

@@ -21,7 +21,7 @@ _STRANGE: tuple[Any, ...] = (
     None, True, -1, 0, 2**63, 1e308, float("nan"), float("inf"), "", "x" * 300, b"\x00\xff",
     [], {}, [[]], {"a": {"b": []}}, "../../escape", "\x1b[2J\n", "é" * 70, 4_000_000_000, "0\x00",
 )  # fmt: skip
-_MOST_GROWTH_MB = 20.0
+_MAX_GROWTH_MB = 20.0
 _MESSAGES = (Request, Reply, ScanEvent, DesiredState, FrameHeader)
 
 
@@ -51,7 +51,7 @@ def message_rows(count: int, seed: int) -> list[Row]:
             "fuzzed messages",
             "0 deaths, 0 growth, words in one line",
             f"{count}, {deaths} deaths, {grown_mb:.1f} MB more",
-            deaths == 0 and grown_mb < _MOST_GROWTH_MB,
+            deaths == 0 and grown_mb < _MAX_GROWTH_MB,
         )
     ]
 

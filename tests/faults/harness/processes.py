@@ -17,7 +17,7 @@ import psutil
 from running_station import Station
 from table import Row, percentile
 
-from station.booth.health import MOST_AGE_S, booth_health
+from station.booth.health import MAX_AGE_S, booth_health
 from station.core.config import BoothConfig, load_config
 
 _NAMED_S, _REPLACED_S, _FRAMES_S = 5.0, 15.0, 3.0
@@ -225,7 +225,7 @@ def _named(config: BoothConfig, name: str) -> bool:
 
 def _told_anew(config: BoothConfig, name: str, old: int) -> bool:
     told = booth_health(config).processes[name]
-    return bool(told) and told["pid"] != old and told["age_s"] < MOST_AGE_S
+    return bool(told) and told["pid"] != old and told["age_s"] < MAX_AGE_S
 
 
 def _until(true: Callable[[], bool]) -> None:

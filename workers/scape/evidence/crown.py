@@ -57,19 +57,19 @@ _REACHED_M = 0.003
 """Readings as near to the top as this show it."""
 _HEAD_RADIUS_M = 0.08
 """Readings so near to the vertical through the top are the head's."""
-_LEAST_READINGS = 5
+_MIN_READINGS = 5
 """Fewer of them may be stray."""
 _UNKNOWN_HEAD_M = 0.03
 """Standard deviation where there is no reading of the head: the length of a head varies by it."""
 _FARTHEST_M = 0.012
 """Largest distance between the outline and the observed end: beyond it the cameras see a bun, a hat
 or a hand."""
-_LEAST_COLUMNS = 6
+_MIN_COLUMNS = 6
 """Fewer columns are not used."""
 _SIGMA_M = 0.0015
 """Standard deviation of one camera's observation, however many columns it has: half a pixel, or
 0.05 degrees of its pose."""
-_LEAST_WIDTH_PX = 1e-9
+_MIN_WIDTH_PX = 1e-9
 """Guards the division by the width of a line that stands upright in the image."""
 
 
@@ -125,7 +125,7 @@ def crown_sigma_m(
     top = cap.points[np.argmax(cap.points[:, 2])]
     over_head = np.linalg.norm(points[:, :2] - top[:2], axis=1) < _HEAD_RADIUS_M
     heights = np.sort(points[over_head, 2])
-    gap = float(top[2] - heights[-_LEAST_READINGS]) if len(heights) >= _LEAST_READINGS else np.inf
+    gap = float(top[2] - heights[-_MIN_READINGS]) if len(heights) >= _MIN_READINGS else np.inf
     if gap > _CAP_M:
         return _UNKNOWN_HEAD_M
     if gap < _REACHED_M:
@@ -172,7 +172,7 @@ def _rows_of(view: CameraView, pose: Array, cap: _Cap) -> tuple[Rows, bool]:
     direction = out * (pose[:3, 1] - slope[:, None] * pose[:3, 2]) / length[:, None]
     high = cap.points[place, 2] > cap.points[:, 2].max() - _CROWN_M
     used = high & (booth >= 0)
-    behind = bool(np.count_nonzero(used) >= _LEAST_COLUMNS)
+    behind = bool(np.count_nonzero(used) >= _MIN_COLUMNS)
     distance = (out * (booth - row) - 0.5) * pixel_m / length
     if not behind:
         used = high & (last >= 0)
@@ -181,7 +181,7 @@ def _rows_of(view: CameraView, pose: Array, cap: _Cap) -> tuple[Rows, bool]:
         if not used.any() or np.median(distance[used]) < 0.0:
             return _NO_ROWS, False
     count = int(used.sum())
-    if count < _LEAST_COLUMNS or abs(np.median(distance[used])) > _FARTHEST_M:
+    if count < _MIN_COLUMNS or abs(np.median(distance[used])) > _FARTHEST_M:
         return _NO_ROWS, False
     information = np.full(count, 1.0 / (count * _SIGMA_M**2))
     found = Rows(cap.vertex[place[used]], direction[used], distance[used], information)
@@ -205,7 +205,7 @@ def _outline(places: Array, edges: Index, width: int) -> tuple[Index, Array, Ind
     line = np.repeat(np.arange(len(edges)), count)
     column = np.arange(len(line)) + np.repeat(first - np.cumsum(count) + count, count)
     a, b = places[start[line]], places[stop[line]]
-    share = (column - a[:, 0]) / np.maximum(b[:, 0] - a[:, 0], _LEAST_WIDTH_PX)
+    share = (column - a[:, 0]) / np.maximum(b[:, 0] - a[:, 0], _MIN_WIDTH_PX)
     height = a[:, 1] + share * (b[:, 1] - a[:, 1])
     row = np.full(width + 2 * _SLOPE_PX, np.nan)
     inner = row[_SLOPE_PX:-_SLOPE_PX]

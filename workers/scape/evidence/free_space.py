@@ -26,7 +26,7 @@ _MARGIN_PX = 1.5
 """Flicker of the outline, which does not count."""
 _DEEPEST_PX = 40.0
 """Distance from the outline beyond which a vertex is not moved: the limb is elsewhere."""
-_LEAST_SLOPE = 1e-6
+_MIN_SLOPE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
     wrong = behind & (deep > _MARGIN_PX) & (deep < _DEEPEST_PX)
     vertex, u, v, deep = vertex[wrong], u[wrong], v[wrong], deep[wrong]
     slope = np.stack([view.slope[0][v, u], view.slope[1][v, u]], axis=1).astype(np.float64)
-    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), _LEAST_SLOPE)
+    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), _MIN_SLOPE)
     axes = pose[:3, :2]
     return Intrusions(
         vertex,

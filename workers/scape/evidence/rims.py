@@ -30,7 +30,7 @@ _GAP_PX = 2
 """Width of the gap without readings at an edge, behind which the background must be seen."""
 _SMOOTH_PX = 1.0
 """Standard deviation of the filter that smooths the silhouette."""
-_LEAST_SLOPE = 0.12
+_MIN_SLOPE = 0.12
 """Least slope of the smoothed silhouette per pixel: a straight edge has three times as much, a slit
 between fingers none."""
 _LATERAL_PX = 0.8
@@ -78,7 +78,7 @@ def _rim(view: CameraView, vertices: Array) -> tuple[Array, Array, Array]:
     y, x = np.nonzero(edge)
     outwards = -np.stack([slope_u[y, x], slope_v[y, x]], axis=1).astype(np.float64)
     steep = np.linalg.norm(outwards, axis=1)
-    kept = steep > _LEAST_SLOPE
+    kept = steep > _MIN_SLOPE
     y, x, outwards = y[kept], x[kept], outwards[kept] / steep[kept, None]
     return _lifted(view.calibration, (x, y) + corner[:, None], outwards, depth[y, x])
 

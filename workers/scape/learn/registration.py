@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 _SCOUT_SAMPLES = 250
 _SCOUT_POINTS = 800
-_MOST_ANGLE_RAD = np.radians(60.0)
+_MAX_ANGLE_RAD = np.radians(60.0)
 _ACROSS = 0.05
 """Weight of a residual across the normal, against one along it."""
 _NOISE_M = 0.002
@@ -169,7 +169,7 @@ def _pairs(
         np.concatenate([normals[mine], normals[back]]),
         along,
         max_distance_m=gate_m,
-        max_angle_rad=_MOST_ANGLE_RAD,
+        max_angle_rad=_MAX_ANGLE_RAD,
     )
     sample, offsets, along, area = sample[kept], offsets[kept], along[kept], area[kept]
     residual = np.einsum("ni,ni->n", along, offsets)

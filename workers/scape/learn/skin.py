@@ -18,11 +18,11 @@ from workers.scape.surface.crossings import crossing_pairs
 _DIRECTIONS = 400
 _HIDDEN = 0.05
 """A vertex from which fewer than this share of all directions lead outside is hidden."""
-_LEAST_CAVITY = 100
+_MIN_CAVITY = 100
 """Vertices; smaller folds (nostrils, ears, between the toes) are skin."""
 _OFF_SURFACE_M = 1e-4
 _STEP_M = 1e-4
-_MOST_STEPS = 60
+_MAX_STEPS = 60
 _BEND = 0.3
 """Cost of bending by one radian, against the triangles' area, when a gap is closed."""
 
@@ -60,7 +60,7 @@ def separated(vertices: Array, faces: Faces, mirror: NDArray[np.int32]) -> Array
     Between the toes of a mean body, for instance; `mirror` as in `outer_skin`.
     """
     apart = vertices.copy()
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         pairs = crossing_pairs(apart, faces)
         if not len(pairs):
             break
@@ -102,7 +102,7 @@ def _large_pieces(faces: Faces, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         (np.ones(both.sum()), (tail[both], head[both])), shape=(len(chosen), len(chosen))
     )
     _, piece = connected_components(links, directed=False)
-    return np.asarray(chosen & (np.bincount(piece)[piece] >= _LEAST_CAVITY))
+    return np.asarray(chosen & (np.bincount(piece)[piece] >= _MIN_CAVITY))
 
 
 def _boundary(faces: Faces) -> Edges:

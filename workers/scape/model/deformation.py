@@ -26,9 +26,9 @@ _PINNED = 0
 """Vertex at the origin of solutions, since a Laplacian leaves the translation free."""
 _COLUMNS_AT_ONCE = 16
 """Right-hand sides that are solved at once; more do not fit into the processor's cache."""
-_LEAST_AREA = 1e-2
+_MIN_AREA = 1e-2
 """Least weight of a triangle, as a share of the mean: slivers keep their vertices in place."""
-_LEAST_NORMAL_M2 = 1e-12
+_MIN_NORMAL_M2 = 1e-12
 """Guards the division by the length of a vertex normal."""
 
 
@@ -65,7 +65,7 @@ def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Area-weighted unit normals (P, 3), outwards for counter-clockwise faces."""
     normals = kernels.summed_at_corners(area_vectors(vertices, faces), faces, len(vertices))
     return np.asarray(
-        normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _LEAST_NORMAL_M2)
+        normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _MIN_NORMAL_M2)
     )
 
 
@@ -100,7 +100,7 @@ class EdgeSolver:
     def build(cls, vertices: Array, faces: Faces) -> EdgeSolver:
         """Factor the normal matrix of a template's triangles."""
         areas = triangle_areas(vertices, faces)
-        weights = np.maximum(areas / areas.mean(), _LEAST_AREA)
+        weights = np.maximum(areas / areas.mean(), _MIN_AREA)
         count = len(vertices)
         tail = faces.ravel()
         head = np.roll(faces, -1, axis=1).ravel()

@@ -1,4 +1,5 @@
-"""One job in a process of its own, seen from the pool: the order, the wait, how it ended."""
+"""Handle of a job that runs in a process of its own: start it, wait for it, and learn how it
+ended."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ _LOOK_S = 0.2
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
 Blame = Literal["scan", "job", "station", "disk", "nobody"]
-"""Cause of a bad end: the scan cannot be used; the job crashed or hung; something outside ended
+"""Cause of a failure: the scan cannot be used; the job crashed or hung; something outside ended
 the process; the disk refused; the station is being stopped."""
 
 
@@ -33,7 +34,7 @@ class Outcome:
     status: str = ""
     """Verdict of the result ("ok" or "rescan"); empty if there is none."""
     reason: str = ""
-    """Why to scan again, or why there is no result."""
+    """Reason to scan again, or reason why there is no result."""
     blame: Blame = "nobody"
 
 
@@ -48,7 +49,7 @@ class JobProcess:
         )
 
     def send(self, bundle: Path, out: Path, config: BoothConfig) -> None:
-        """Give it the job. One that died before it began is found out by `outcome`."""
+        """Send it the job. A process that died before it began is detected by `outcome`."""
         order = {
             "bundle": str(bundle),
             "out": str(out),
@@ -77,7 +78,9 @@ class JobProcess:
             self.kill()
             if stop.is_set():
                 return Outcome(reason="the station was stopped")
-            return Outcome(reason=f"the job hung for {timeout_s:g} s", blame="job")
+            return Outcome(
+                reason=f"the job was not done after {timeout_s:g} s and was stopped", blame="job"
+            )
         process.wait()
         if "error" in last:
             return Outcome(reason=str(last["error"]), blame="scan")
@@ -94,7 +97,8 @@ class JobProcess:
     def _last_message(
         self, deadline_s: float, stop: threading.Event, begun: Callable[[], None]
     ) -> dict[str, object] | None:
-        """The last line that the process says before it ends; None at the deadline or the stop."""
+        """The last line that the process writes before it ends; None at the deadline or the
+        stop."""
         stdout = self._process.stdout
         assert stdout is not None
         last: dict[str, object] = {}

@@ -1,4 +1,4 @@
-"""Scans as the operator takes them: a countdown for the person, then the station's own scan."""
+"""Scans taken from the console: a countdown for the person, then the scan itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KEPT = 100
 
 @dataclass(slots=True)
 class _Waiting:
-    """A scan that the station has not been told of, or refused."""
+    """A scan that has not been sent to the station yet, or that it refused."""
 
     label: str
     starts_s: float
@@ -26,8 +26,8 @@ class _Waiting:
     reason: str = ""
 
 
-class Desk:
-    """One countdown at a time; twice the same scan id is one scan."""
+class ScanCountdown:
+    """One countdown at a time; a repeated scan id is the same scan."""
 
     def __init__(self, config: BoothConfig, events: EventLog) -> None:
         self._config, self._events = config, events
@@ -48,7 +48,7 @@ class Desk:
                 raise RefusedError("another scan is being taken; wait for it to end")
             if countdown_s <= 0:
                 return command(self._config, Request("scan", scan_id, label))
-            # Asked before the person holds still for nothing.
+            # Checked first, so that the person does not hold still in vain.
             if not command(self._config, Request("status"))["streaming"]:
                 raise RefusedError("the sensors are stopped; run station start first")
             self._waiting[scan_id] = _Waiting(label, time.monotonic() + countdown_s)
@@ -59,12 +59,12 @@ class Desk:
         return document
 
     def status(self, scan_id: str) -> dict[str, Any] | None:
-        """A scan's state before the station knew of it; None if it does, or nobody does."""
+        """State of a scan that has not been sent to the station; None for any other."""
         with self._lock:
             return self._document(scan_id) if scan_id in self._waiting else None
 
     def cancel(self, scan_id: str) -> dict[str, Any]:
-        """Give a scan up.
+        """Cancel a scan.
 
         Raises:
             NotRunningError, RefusedError: as the station says.
@@ -78,7 +78,7 @@ class Desk:
         return command(self._config, Request("cancel", scan_id))
 
     def _count(self, scan_id: str) -> None:
-        """Tell the seconds, then the station."""
+        """Publish the remaining seconds, then send the scan to the station."""
         while (left_s := self._left_s(scan_id)) is not None and left_s > 0:
             whole = int(left_s + 0.999)
             self._tell(scan_id, "countdown", left_s=whole)

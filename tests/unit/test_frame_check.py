@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from station.booth.sensor_truth import CameraTruth, wrong_sensors
+from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.messaging.messages import FrameHeader
 
 _HZ = 60_000_000
@@ -20,7 +20,7 @@ def _picture(seed: int) -> np.ndarray:
 
 
 def _run(
-    truth: CameraTruth, count: int, *, hz: float = 30.0, frozen: bool = False, stuck: bool = False
+    truth: FrameCheck, count: int, *, hz: float = 30.0, frozen: bool = False, stuck: bool = False
 ) -> int:
     """Feed frames; returns how many may enter a frameset."""
     return sum(
@@ -32,33 +32,33 @@ def _run(
 
 
 def test_a_living_sensor_is_believed() -> None:
-    truth = CameraTruth()
+    truth = FrameCheck()
     assert _run(truth, 40) == 40
     assert truth.trouble(40 / 30) == ""
     assert truth.rate_hz() == pytest.approx(30.0, rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [("frozen", "same picture"), ("stuck", "time stamps stand still")]
+    ("fault", "words"), [("frozen", "same picture"), ("stuck", "time stamps do not advance")]
 )
 def test_what_repeats_is_named_and_never_used(fault: str, words: str) -> None:
     """Ten identical frames were accepted: in a shop, they are the previous customer's."""
-    truth = CameraTruth()
+    truth = FrameCheck()
     assert _run(truth, 30, frozen=fault == "frozen", stuck=fault == "stuck") == 1
     assert words in truth.trouble(30 / 30)
 
 
 def test_a_frame_that_comes_twice_is_only_left_out() -> None:
-    truth = CameraTruth()
+    truth = FrameCheck()
     _run(truth, 20)
     assert not truth.usable(_header(21, round(20 / 30 * _HZ)), _picture(20))
     assert truth.trouble(21 / 30) == ""
 
 
 def test_half_the_rate_is_named_and_lost_frames_are_not() -> None:
-    slow, lossy = CameraTruth(), CameraTruth()
+    slow, lossy = FrameCheck(), FrameCheck()
     _run(slow, 30, hz=15.0)
-    assert "15 frames a second" in slow.trouble(30 / 15)
+    assert "15 frames per second" in slow.trouble(30 / 15)
     rng = np.random.default_rng(0)
     for i in range(1, 200):
         if rng.random() > 0.3:
@@ -73,5 +73,5 @@ def test_sensors_that_changed_places_are_named() -> None:
     assert len(swapped) == 2
     assert "camera front is sensor A2, but A1 was calibrated" in swapped[0]
     [twice] = wrong_sensors({"front": "A1", "back": "A1"}, {"front": "A1"})
-    assert "one sensor (A1)" in twice
+    assert "the same sensor (A1)" in twice
     assert wrong_sensors({"front": "recorded:front"}, calibrated) == []

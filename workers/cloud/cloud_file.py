@@ -16,7 +16,7 @@ from workers.cloud.observed import LEAST_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
-_MOST_POINTS = 250_000
+_MAX_POINTS = 250_000
 _Z_FROM_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation of a cloud whose y points up."""
 _NORMAL_NEIGHBOURS = 24
@@ -100,8 +100,8 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
         raise InputError(f"{path} has {len(points)} points; a body needs {LEAST_POINTS}")
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not numbers; repair it")
-    if len(points) > _MOST_POINTS:
-        kept = np.random.default_rng(len(points)).permutation(len(points))[:_MOST_POINTS]
+    if len(points) > _MAX_POINTS:
+        kept = np.random.default_rng(len(points)).permutation(len(points))[:_MAX_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
     return cloud
 
@@ -192,7 +192,7 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
     if not POSSIBLE_HEIGHTS_M[0] < high_m - low_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(
             f"{path} is {high_m - low_m:.4g} high with {up} up; metres were expected, or is "
-            f"another axis up? see --up"
+            "another axis up? see --up"
         )
     if abs(low_m) > _OFF_FLOOR_M:
         raise InputError(f"{path} has its soles at {low_m:.3f} m; move them to the floor at 0")

@@ -1,7 +1,6 @@
-"""Whether a camera's frames are what a living sensor gives (pure).
-
-A sensor that hangs may go on sending its last picture, or pictures with one time stamp: in a shop
-those would be of the previous customer. Such frames enter no frameset, and the camera is named.
+"""Checks that a camera's frames come from a working sensor (pure). A sensor that hangs may keep
+sending its last picture, or pictures with one time stamp: in a shop those would show the previous
+customer. Such frames are not used, and the camera is reported.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 from station.messaging.messages import FrameHeader
 from station.sensors.base import is_serial
 
-LEAST_RATE_HZ = 25.0
-"""A Kinect gives 30; one that falls back to 15 shares its USB controller."""
+MIN_RATE_HZ = 25.0
+"""A Kinect sends 30; one that falls back to 15 shares its USB controller."""
 _ROWS_LOOKED_AT = 8
-"""Every eighth row: two pictures with the same noise in all of them are one picture."""
+"""Every eighth row: two pictures with identical noise in all of them are the same picture."""
 _REPEATS_NAMED = 5
 """A sixth of a second; a single frame that comes twice is only left out."""
 _REMEMBERED_S = 1.0
@@ -29,7 +28,7 @@ _STEPS = 15
 
 
 @dataclass(slots=True)
-class CameraTruth:
+class FrameCheck:
     """Plausibility of one camera's frames. Feed it every frame."""
 
     _ticks: int | None = None
@@ -40,7 +39,7 @@ class CameraTruth:
     _trouble: str = ""
     _trouble_s: float = -1e9
     _steps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_STEPS))
-    """Seconds of the device's clock from frame to frame."""
+    """Intervals between frames by the device's clock, seconds."""
 
     def usable(self, header: FrameHeader, depth: NDArray[np.uint16]) -> bool:
         """Whether a frame may enter a frameset."""
@@ -51,19 +50,19 @@ class CameraTruth:
         self._same_stamps = self._same_stamps + 1 if stuck else 0
         if self._ticks is not None:
             ticks, frames = header.device_ticks - self._ticks, header.sequence - self._sequence
-            # A counter that wrapped or was reset says nothing of the rate.
+            # A counter that wrapped or was reset says nothing about the rate.
             if ticks > 0 and frames > 0:
                 self._steps_s.append(ticks / header.tick_hz / frames)
         self._picture, self._ticks = picture, header.device_ticks
         self._sequence = header.sequence
         if self._same_stamps >= _REPEATS_NAMED:
-            self._name("its time stamps stand still", header.received_s)
+            self._name("its time stamps do not advance", header.received_s)
         elif self._same_pictures >= _REPEATS_NAMED:
-            self._name("it sends the same picture again and again", header.received_s)
+            self._name("it keeps sending the same picture", header.received_s)
         return not (again or stuck)
 
     def rate_hz(self) -> float | None:
-        """Frames a second by the device's own clock; None before enough have come."""
+        """Frame rate by the device's own clock; None before enough frames have arrived."""
         return 1.0 / median(self._steps_s) if len(self._steps_s) == _STEPS else None
 
     def trouble(self, now_s: float) -> str:
@@ -71,10 +70,10 @@ class CameraTruth:
         if now_s - self._trouble_s < _REMEMBERED_S:
             return f"{self._trouble}; unplug the sensor and plug it in again"
         rate_hz = self.rate_hz()
-        if rate_hz is not None and rate_hz < LEAST_RATE_HZ:
+        if rate_hz is not None and rate_hz < MIN_RATE_HZ:
             return (
-                f"it gives {rate_hz:.0f} frames a second, {LEAST_RATE_HZ:.0f} are needed; "
-                "give it a USB controller of its own"
+                f"it sends {rate_hz:.0f} frames per second, {MIN_RATE_HZ:.0f} are needed; "
+                "connect it to a USB controller of its own"
             )
         return ""
 
@@ -95,14 +94,14 @@ def wrong_sensors(found: dict[str, str], calibrated: dict[str, str]) -> list[str
             continue
         if serial in owners:
             wrong.append(
-                f"cameras {owners[serial]} and {name} are one sensor ({serial}); "
-                "correct the serials in booth.toml"
+                f"cameras {owners[serial]} and {name} are the same sensor ({serial}); correct the "
+                "serial numbers in booth.toml"
             )
         owners[serial] = name
         known = calibrated.get(name, "")
         if is_serial(known) and known != serial:
             wrong.append(
                 f"camera {name} is sensor {serial}, but {known} was calibrated; "
-                "put the sensors back where they were, or calibrate: station calibrate"
+                "put the sensors back where they were, or run station calibrate"
             )
     return wrong
