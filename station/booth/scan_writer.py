@@ -111,7 +111,7 @@ class ScanWriter:
                 "its disk with station status, then scan again",
             )
         except Exception as error:
-            self._log.exception("scan %s", order.scan_id)
+            self._log.exception("scan %s", order.scan_id, extra={"scan": order.scan_id})
             self._failed(order, f"the scan could not be written ({error}); scan again")
 
     def _begin(self, order: Order) -> None:
@@ -159,6 +159,7 @@ class ScanWriter:
             "scan %s written %.2f s after its last frameset",
             order.scan_id,
             time.monotonic() - collection.complete_s,
+            extra={"scan": order.scan_id},
         )
         self._end(order.scan_id, True, "")
 
@@ -195,7 +196,8 @@ class ScanWriter:
         self._end(order.scan_id, False, reason)
 
     def _end(self, scan_id: ScanId, accepted: bool, reason: str) -> None:
-        self._log.info("scan %s %s %s", scan_id, "accepted" if accepted else "failed", reason)
+        verdict = "accepted" if accepted else "failed"
+        self._log.info("scan %s %s %s", scan_id, verdict, reason, extra={"scan": scan_id})
         self._events.put(Ended(scan_id, accepted, reason))
 
     def _settle_abandoned(self) -> None:

@@ -16,7 +16,7 @@ import logging
 import os
 import signal
 import socket
-import sys
+import struct
 import tempfile
 import threading
 import time
@@ -39,6 +39,10 @@ _BEAT_PERIOD_S = 0.5
 _HEALTH_PERIOD_S = 0.25
 _MAX_HEALTH_BYTES = 1 << 20
 
+_JOURNAL = "/run/systemd/journal/socket"
+_PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+"""Python's levels as syslog's; what is below them is 7, for debugging."""
+
 
 def stop_event() -> threading.Event:
     """Set by SIGTERM and SIGINT; a process' main loop watches it."""
@@ -49,14 +53,19 @@ def stop_event() -> threading.Event:
 
 
 def set_up_logs(process: str) -> logging.Logger:
-    """Log lines on stderr; systemd adds its own times."""
-    times = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO,
-        format=f"{times}{process}: %(levelname)s %(message)s",
-        datefmt="%H:%M:%S",
-    )
+    """Log lines in systemd's journal where it listens, else on stderr.
+
+    A line that is logged with `extra={"scan": scan_id}` has the field SCAN there: `journalctl
+    SCAN=...` is one scan.
+    """
+    if is_read_by_journal():
+        handler: logging.Handler = JournalHandler(process)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler()
+        words = f"%(asctime)s {process}: %(levelname)s %(message)s"
+        handler.setFormatter(logging.Formatter(words, datefmt="%H:%M:%S"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     return logging.getLogger(process)
 
 
@@ -71,6 +80,44 @@ def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]
     busy = BoothError(f"a {process} process is already running here ({lock}); end it first")
     with held(lock, busy):
         yield set_up_logs(process)
+
+
+def is_read_by_journal(descriptor: int = 2) -> bool:
+    """Whether systemd reads what is written to a file descriptor, stderr."""
+    found = os.fstat(descriptor)
+    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
+class JournalHandler(logging.Handler):
+    """Sends lines to the journal by its own protocol; what it does not take goes to stderr."""
+
+    def __init__(self, process: str, address: str = _JOURNAL) -> None:
+        super().__init__()
+        self._process, self._address = process, address
+        self._stderr = logging.StreamHandler()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one line."""
+        fields = {
+            "MESSAGE": self.format(record),
+            "PRIORITY": next((p for level, p in _PRIORITIES if record.levelno >= level), 7),
+            "SYSLOG_IDENTIFIER": self._process.replace(" ", "-"),
+        }
+        scan = getattr(record, "scan", None)
+        if scan is not None:
+            fields["SCAN"] = scan
+        try:
+            data = b"".join(_field(name, str(value)) for name, value in fields.items())
+            self._socket.sendto(data, self._address)
+        except OSError:
+            self._stderr.handle(record)
+
+
+def _field(name: str, value: str) -> bytes:
+    """A field in binary form, whose value may hold several lines."""
+    data = value.encode(errors="replace")
+    return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
 
 
 def set_up_caches() -> None:

@@ -122,10 +122,12 @@ class HandOver:
             self._log.warning(
                 "%s not handed over to %s (%s); retrying in %.0f s",
                 entry.scan_id, entry.target, error, after.next_s - now_s,
+                extra={"scan": entry.scan_id},
             )  # fmt: skip
             return
         self._ledger.finish(entry)
-        self._log.info("%s handed over to %s", entry.scan_id, entry.target)
+        words = "%s handed over to %s"
+        self._log.info(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
 
 
 @click.command()

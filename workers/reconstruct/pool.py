@@ -99,7 +99,7 @@ class Worker:
         if outcome.status:
             claim.deliver(out, outcome.status, outcome.reason)
             self.delivered += 1
-            self._log.info("scan %s delivered", claim.scan_id)
+            self._log.info("scan %s delivered", claim.scan_id, extra={"scan": claim.scan_id})
             return
         shutil.rmtree(out, ignore_errors=True)
         self._settle(claim, outcome)
@@ -122,13 +122,15 @@ class Worker:
         else:
             claim.count_try(outcome.reason)
             given_up = claim.tries > self._config.workers.retries
+        about = {"scan": claim.scan_id}
         if given_up or outcome.blame == "scan":
             claim.fail(outcome.reason)
             self.failed += 1
-            self._log.error("scan %s failed: %s", claim.scan_id, outcome.reason)
+            self._log.error("scan %s failed: %s", claim.scan_id, outcome.reason, extra=about)
         else:
             claim.put_back()
-            self._log.warning("scan %s is tried again: %s", claim.scan_id, outcome.reason)
+            words = "scan %s is tried again: %s"
+            self._log.warning(words, claim.scan_id, outcome.reason, extra=about)
 
 
 def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> None:
@@ -168,7 +170,8 @@ def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
     """Recover scans whose worker died; returns a description of any obstacle."""
     try:
         for scan_id in spool.recover(config.workers.retries):
-            log.warning("scan %s is put back: its worker has died", scan_id)
+            words = "scan %s is put back: its worker has died"
+            log.warning(words, scan_id, extra={"scan": scan_id})
     except OSError as error:
         return f"the spool cannot be looked through ({error}); check its disk"
     return ""
