@@ -39,7 +39,6 @@ _ANSWER_S = 30.0
 _COMMAND = "/usr/bin/station"
 _PASSWORD_GROUPS = 4
 """Groups of 16 random bits: 64 bits cannot be guessed against argon2id."""
-_BODY = Path(__file__).parents[1] / "simulation/bodies/ann.npz"
 _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
 """Folders that the services do not see."""
 
@@ -52,7 +51,7 @@ _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="replay the recordings in this folder instead of sensors",
 )
-@click.option("--virtual", is_flag=True, help="render a virtual booth with a person and replay it")
+@click.option("--virtual", is_flag=True, help="replay a virtual booth with a person in it")
 @click.option(
     "--replace", is_flag=True, help="write a new booth.toml; the old one is kept beside it"
 )
@@ -82,7 +81,7 @@ def setup(
     changed = replace or not path.exists()
     if changed:
         if virtual:
-            recordings = _render(STATE_FOLDER if installed else path.parent)
+            recordings = _record_virtual_booth(_virtual_folder(path))
         cameras = _find(pairs, recordings, installed=installed)
         _write(path, cameras, installed=installed)
     elif virtual or recordings or pairs:
@@ -90,6 +89,9 @@ def setup(
             f"{path} exists; --replace writes a new one and keeps the old one beside it"
         )
     config = load_config(path)
+    if any(_recording_folder(camera) == _virtual_folder(path) for camera in config.cameras):
+        # A restored booth comes without them.
+        _record_virtual_booth(_virtual_folder(path))
     click.echo(f"{path}: {len(config.cameras)} cameras" + ("" if changed else ", kept"))
     for camera in config.cameras:
         click.echo(f"  {camera.name:<16} {_source(camera)}")
@@ -141,23 +143,29 @@ def _write(path: Path, cameras: Sequence[FreenectCamera], *, installed: bool) ->
         path.chmod(0o640)
 
 
-def _render(folder: Path) -> Path:
-    """Record a virtual booth, as its user; needs the simulation's libraries."""
-    out = folder / "virtual"
+def _virtual_folder(config_path: Path) -> Path:
+    return (STATE_FOLDER if config_path == CONFIG else config_path.parent) / "virtual"
+
+
+def _recording_folder(camera: CameraConfig) -> Path | None:
+    recorded = isinstance(camera, FreenectCamera) and camera.recording
+    return recorded.parent if recorded else None
+
+
+def _record_virtual_booth(out: Path) -> Path:
+    """Record the virtual booth that is shipped where it is not yet, as the booth's user."""
     if (out / "calibration.json").exists():
         return out
-    click.echo("rendering what four Kinects see of a virtual person ...")
-    options = ("--body", str(_BODY), "--out", str(out), "--frames", "12", "--passes", "150")
+    click.echo("recording what four Kinects see of a virtual person ...")
     user = {"user": USER, "group": USER} if is_installed_root() else {}
     done = subprocess.run(
-        [sys.executable, "-m", "station.cli", "record-virtual", *options],
-        stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", "station.simulation.shipped", str(out)],
         cwd="/",
         check=False,
         **user,  # type: ignore[call-overload]
     )
     if done.returncode:
-        raise BoothError(f"the virtual booth was not rendered; {folder} holds no recordings")
+        raise BoothError(f"the virtual booth was not recorded; is there space in {out.parent}?")
     return out
 
 
@@ -202,13 +210,23 @@ def _source(camera: CameraConfig) -> str:
     return camera.driver
 
 
+def compare_sensors(named: Sequence[str], connected: Sequence[str]) -> list[str]:
+    """List what is left to do where the sensors that booth.toml names are not those connected."""
+    missing, unknown = sorted({*named} - {*connected}), sorted({*connected} - {*named})
+    left = [f"connect the sensors {', '.join(missing)}"] if missing else []
+    if unknown:
+        left.append(
+            f"connected, but not in booth.toml: {', '.join(unknown)}; to replace a sensor, put the "
+            "new number in place of the old one there"
+        )
+    return left
+
+
 def _say_what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> None:
     left = []
     physical = [c.serial for c in config.cameras if isinstance(c, FreenectCamera) and c.serial]
     if physical:
-        missing = sorted(set(physical) - set(serial_numbers()))
-        if missing:
-            left.append(f"connect the sensors {', '.join(missing)}")
+        left += compare_sensors(physical, serial_numbers())
         for controller, count in crowded_controllers(connected_cameras()).items():
             left.append(
                 f"{count} sensors share one USB controller ({controller}): connect each to one of "

@@ -164,9 +164,9 @@ class FreenectDriver:
         if result < 0:
             self._release()
             raise DriverError(
-                f"{self._name} cannot be opened ({count} connected): check the serial with "
-                "freenect-camtest, whether another program uses it, and the permission "
-                "(install deploy/60-booth-cameras.rules)"
+                f"{self._name} cannot be opened ({count} connected): check the serial number "
+                "(station setup lists those connected), whether another program uses it, and the "
+                "permission (install deploy/60-booth-cameras.rules)"
             )
         mode = library.freenect_find_depth_mode(_RESOLUTION_MEDIUM, _DEPTH_11BIT)
         # Kept as an attribute: the library calls it for as long as the device is open.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -15,9 +16,12 @@ from station.administration.booth_file import booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
 from station.administration.migrate import migrate
 from station.administration.restore import restore
-from station.administration.setup import setup
+from station.administration.setup import compare_sensors, setup
 from station.core.config import load_config
 from station.core.errors import BoothError, ConfigError, FormatError
+from station.core.rig import Rig
+from station.sensors.freenect import FreenectCamera
+from station.sensors.recording import check_recording
 
 
 def _recordings(folder: Path) -> Path:
@@ -62,6 +66,20 @@ def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
     assert not (tmp_path / "booth.toml").exists()
 
 
+def test_a_virtual_booth_is_set_up_and_comes_back_without_its_recordings(tmp_path: Path) -> None:
+    config = tmp_path / "booth.toml"
+    _run(setup, "--config", config, "--virtual")
+    assert Rig.load(load_config(config).calibration).cameras.keys() == {
+        camera.name for camera in load_config(config).cameras
+    }
+    shutil.rmtree(tmp_path / "virtual")
+    assert ", kept" in _run(setup, "--config", config)
+    for camera in load_config(config).cameras:
+        assert isinstance(camera, FreenectCamera)
+        assert camera.recording is not None
+        assert check_recording(camera.recording)
+
+
 def test_sensors_get_the_names_that_were_given(tmp_path: Path) -> None:
     cameras = name_cameras(["A", "B", "C", "D", "E"], ["back-lower=B"])
     assert [(camera.serial, camera.name) for camera in cameras] == [
@@ -76,6 +94,13 @@ def test_sensors_get_the_names_that_were_given(tmp_path: Path) -> None:
     assert load_config(path).cameras == tuple(cameras)
     with pytest.raises(ConfigError, match="connected sensors: A"):
         name_cameras(["A"], ["front=Z"])
+
+
+def test_a_sensor_that_was_replaced_is_named_with_the_new_one() -> None:
+    assert compare_sensors(["A1", "A2"], ["A2", "A1"]) == []
+    left = compare_sensors(["A1", "A2"], ["A2", "B7"])
+    assert left[0] == "connect the sensors A1"
+    assert left[1].startswith("connected, but not in booth.toml: B7")
 
 
 def test_two_kinects_on_one_controller_are_named(tmp_path: Path) -> None:
