@@ -69,6 +69,7 @@ package: $(VENV)/dev.stamp
 	$(BIN)/python deploy/package/build.py $(ARGS)
 
 test-install: $(VENV)/dev.stamp
+	PYTHONPATH=tests $(BIN)/python -m install.possible
 	$(BIN)/python -m pytest -x -v tests/install $(ARGS)
 
 lock: $(VENV)/dev.stamp

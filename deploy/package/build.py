@@ -18,29 +18,28 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from image import (
+    DEBIAN_PYTHON,
+    SITE,
+    compile_all,
+    dependencies,
+    install,
+    slim,
+    squash,
+    virtual_environment,
+)
+
 ROOT = Path(__file__).parents[2]
 BOOTH, SIMULATION = "body-booth", "body-booth-simulation"
-DEBIAN_PYTHON = Path("/usr/bin/python3.11")
-SITE = Path("lib/python3.11/site-packages")
 MOUNTED = {BOOTH: Path("/opt/booth"), SIMULATION: Path("/opt/booth.simulation")}
 """Package -> where its image is mounted; a .pth file of the booth names the simulation's."""
 
-_NOT_SHIPPED = ("tests", "test")
-_NOT_SHIPPED_FILES = ("*.pyi", "*.h", "*.hpp", "*.cuh", "*.pxd", "*.pyx", "*.a", "*.lib")
 _NOT_SHIPPED_OPEN3D = ("open3d_tf_ops.so", "open3d_torch_ops.so")
 """For machine learning frameworks that a booth has not."""
-
-_COMPILE = ("-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash")
-_LAUNCHER = """#!/opt/booth/bin/python -I
-import sys
-
-from {} import main
-
-sys.exit(main())
-"""
-_SQUASHFS = ("-comp", "zstd", "-Xcompression-level", "9", "-all-root", "-noappend", "-no-xattrs")
 _COMPRESSION = ("-Zgzip", "-z1")
 """The large part of the Debian package is compressed already: more costs a minute, for nothing."""
+_TOOLS = {"dpkg-deb": "dpkg", "mksquashfs": "squashfs-tools"}
+"""Program -> the Debian package that it is in."""
 _MOUNT_UNIT = "opt-booth.simulation.mount"
 
 
@@ -64,9 +63,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder for the files")
     parser.add_argument("--work", type=Path, default=ROOT / "build/package", help="scratch folder")
     parser.add_argument("--simulation", action="store_true", help=f"also {SIMULATION}")
+    parser.add_argument(
+        "--keep", type=Path, help="folder that keeps compiled dependencies for the next build"
+    )
     arguments = parser.parse_args()
-    if not DEBIAN_PYTHON.exists():
-        sys.exit(f"error: {DEBIAN_PYTHON} is missing; packages are built on Debian 12")
+    _check_tools()
     seconds, name = _git("log", "-1", "--format=%ct %H", arguments.commit).split()
     commit = Commit(name, int(seconds))
     os.environ |= {"SOURCE_DATE_EPOCH": seconds, "PYTHONHASHSEED": "0", "TZ": "UTC"}
@@ -76,7 +77,9 @@ def main() -> None:
     shutil.rmtree(work, ignore_errors=True)
     source = _export(commit, work / "source")
     wheel = build_python(source, work, out)
-    print(f"{_relative(build_booth(commit, source, wheel, work / BOOTH, out))}", flush=True)
+    kept = arguments.keep or work / "dependencies"
+    site = dependencies(source / "deploy/lock/booth.txt", MOUNTED[BOOTH] / SITE, kept)
+    print(f"{_relative(build_booth(commit, source, wheel, site, work / BOOTH, out))}", flush=True)
     if arguments.simulation:
         tree = work / SIMULATION
         print(f"{_relative(build_simulation(commit, source, tree, out))}", flush=True)
@@ -85,7 +88,7 @@ def main() -> None:
 def build_python(source: Path, work: Path, out: Path) -> Path:
     """The wheel and the source distribution; returns the wheel."""
     tools, made = work / "tools", work / "python"
-    _install(source / "deploy/lock/build.txt", tools)
+    install(source / "deploy/lock/build.txt", tools)
     subprocess.run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", made, source],
         env={**os.environ, "PYTHONPATH": str(tools)},
@@ -99,17 +102,22 @@ def build_python(source: Path, work: Path, out: Path) -> Path:
     return wheel
 
 
-def build_booth(commit: Commit, source: Path, wheel: Path, tree: Path, out: Path) -> Path:
+def build_booth(
+    commit: Commit, source: Path, wheel: Path, installed: Path, tree: Path, out: Path
+) -> Path:
     """The booth's package: a virtual environment, units, rules, manuals."""
     root = tree.with_suffix(".image")
     site = root / SITE
-    _install(source / "deploy/lock/booth.txt", site)
+    shutil.copytree(installed, site, symlinks=True)
     # pip would note the path that it came from.
+    known = set(site.iterdir())
     shutil.unpack_archive(wheel, site, "zip")
     (site / "booth-simulation.pth").write_text(f"{MOUNTED[SIMULATION]}\n")
-    _slim(site)
-    _virtual_environment(root)
-    _image(BOOTH, root, tree)
+    for package in sorted(set(site.iterdir()) - known):
+        if package.is_dir():
+            compile_all(package, MOUNTED[BOOTH] / SITE / package.name)
+    virtual_environment(root)
+    _squash(BOOTH, root, tree, commit)
     _copy_table(source, tree)
     _manuals(source, tree, commit)
     return _debian_package(BOOTH, commit, source, tree, out)
@@ -120,15 +128,24 @@ def build_simulation(commit: Commit, source: Path, tree: Path, out: Path) -> Pat
     root = tree.with_suffix(".image")
     lock = tree.with_suffix(".txt")
     lock.write_text(_difference(source / "deploy/lock/simulation.txt", source / "deploy/lock"))
-    _install(lock, root)
+    install(lock, root)
     for name in _NOT_SHIPPED_OPEN3D:
         (root / "open3d" / name).unlink(missing_ok=True)
-    _slim(root)
-    _image(SIMULATION, root, tree)
+    slim(root)
+    compile_all(root, MOUNTED[SIMULATION])
+    _squash(SIMULATION, root, tree, commit)
     units = tree / "usr/lib/systemd/system"
     units.mkdir(parents=True)
     shutil.copyfile(source / "systemd" / _MOUNT_UNIT, units / _MOUNT_UNIT)
     return _debian_package(SIMULATION, commit, source, tree, out)
+
+
+def _check_tools() -> None:
+    if not DEBIAN_PYTHON.exists():
+        sys.exit(f"error: {DEBIAN_PYTHON} is missing; packages are built on Debian 12")
+    for program, package in _TOOLS.items():
+        if shutil.which(program) is None:
+            sys.exit(f"error: {program} is missing; apt-get install {package}")
 
 
 def _git(*words: str) -> str:
@@ -157,20 +174,6 @@ def _export(commit: Commit, folder: Path) -> Path:
     return folder
 
 
-def _install(lock: Path, target: Path) -> None:
-    """Install exactly what a lock file says, without running anything of it."""
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    command += ["--no-deps", "--no-compile", "--target", str(target), "--upgrade"]
-    command += ["--require-hashes", "-r", str(lock)]
-    subprocess.run([*command, "--only-binary", ":all:"], check=True, stderr=_quiet())
-    # Programs of the dependencies stay out.
-    shutil.rmtree(target / "bin", ignore_errors=True)
-
-
-def _quiet() -> int | None:
-    return None if sys.stderr.isatty() else subprocess.DEVNULL
-
-
 def _difference(lock: Path, folder: Path) -> str:
     """The entries of one lock file that the booth's own does not have."""
     known = {_name(entry) for entry in _entries(folder / "booth.txt")}
@@ -191,42 +194,10 @@ def _name(entry: str) -> str:
     return entry.split("==")[0]
 
 
-def _slim(site: Path) -> None:
-    """Leave out the dependencies' own tests, headers and type stubs."""
-    for folder in [f for f in site.rglob("*") if f.is_dir() and f.name in _NOT_SHIPPED]:
-        shutil.rmtree(folder, ignore_errors=True)
-    for pattern in _NOT_SHIPPED_FILES:
-        for path in site.rglob(pattern):
-            path.unlink()
-
-
-def _image(name: str, root: Path, tree: Path) -> None:
-    """Compile to byte code that holds by content, since times say nothing, and compress."""
-    subprocess.run(
-        [DEBIAN_PYTHON, *_COMPILE, "-s", root, "-p", MOUNTED[name], root],
-        check=True,
-    )
+def _squash(name: str, root: Path, tree: Path, commit: Commit) -> None:
     place = tree / "usr/lib/body-booth"
     place.mkdir(parents=True)
-    subprocess.run(
-        ["mksquashfs", root, place / f"{name}.squashfs", *_SQUASHFS, "-no-progress"],
-        stdout=subprocess.DEVNULL,
-        check=True,
-    )
-
-
-def _virtual_environment(folder: Path) -> None:
-    """A relocatable environment on Debian's Python, with the two commands."""
-    programs = folder / "bin"
-    programs.mkdir(parents=True)
-    (programs / "python").symlink_to(DEBIAN_PYTHON)
-    (folder / "pyvenv.cfg").write_text(
-        "home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.11\n"
-    )
-    for name, module in (("station", "station.cli"), ("reconstruct", "workers.cli")):
-        program = programs / name
-        program.write_text(_LAUNCHER.format(module))
-        program.chmod(0o755)
+    squash(root, place / f"{name}.squashfs", commit.seconds)
 
 
 def _copy_table(source: Path, tree: Path) -> None:

@@ -2,66 +2,65 @@
 
 from __future__ import annotations
 
-import os
-import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from install.machine import Machine, base_root
+from install.bars import TABLE
+from install.debian_root import base_root
+from install.machine import Machine
+from install.places import DEBIAN, ROOT, WORK, dependencies_of_package
 
-ROOT = Path(__file__).parents[2]
-BODY = ROOT / "station/simulation/bodies/ann.npz"
-_WORK = Path(os.environ.get("BOOTH_TEST_INSTALL", ROOT / "build/test-install"))
-"""Folder in which roots, packages and recordings are kept between two calls."""
+_SUITE_BAR_S = 300.0
+_BEGAN_S = time.monotonic()
 
 
-def _package(commit: str) -> Path:
-    name = subprocess.run(
-        ["git", "rev-parse", commit], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.strip()
-    out = _WORK / "packages" / name
-    if not list(out.glob("body-booth_*.deb")):
-        build = [sys.executable, str(ROOT / "deploy/package/build.py"), "--commit", name]
-        folders = ["--out", str(out), "--work", str(_WORK / "build")]
-        subprocess.run([*build, *folders], check=True)
+def build(commit: str, out: Path, work: Path) -> Path:
+    """The Debian package of a commit, made with its wheel and source distribution in `out`."""
+    command = [sys.executable, str(ROOT / "deploy/package/build.py"), "--commit", commit]
+    folders = ["--out", str(out), "--work", str(work), "--keep", str(WORK / "dependencies")]
+    subprocess.run([*command, *folders], check=True, stdout=subprocess.DEVNULL)
     (package,) = out.glob("body-booth_*.deb")
     return package
 
 
+def _package(revision: str) -> Path:
+    words = ["git", "rev-parse", "--verify", revision]
+    commit = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    out = WORK / "packages" / commit.stdout.strip()
+    made = list(out.glob("body-booth_*.deb"))
+    return made[0] if made else build(revision, out, WORK / "build" / out.name)
+
+
 @pytest.fixture(scope="session")
-def package() -> Path:
+def prepared() -> Iterator[tuple[Future[Path], Future[Path]]]:
+    """Packages of this commit and of the one before, built while the machine is made."""
+    with ThreadPoolExecutor(1) as builder:
+        yield builder.submit(_package, "HEAD"), builder.submit(_package, "HEAD~1")
+
+
+@pytest.fixture(scope="session")
+def package(prepared: tuple[Future[Path], Future[Path]]) -> Path:
     """The Debian package of this commit (what is not committed is not in it)."""
-    return _package("HEAD")
+    return prepared[0].result()
 
 
 @pytest.fixture(scope="session")
-def package_before() -> Path:
+def package_before(prepared: tuple[Future[Path], Future[Path]]) -> Path:
     """The Debian package of the commit before."""
-    return _package("HEAD~1")
+    return prepared[1].result()
 
 
 @pytest.fixture(scope="session")
-def recordings() -> Path:
-    """A virtual booth with a person and its calibration."""
-    folder = _WORK / "recordings"
-    if not (folder / "calibration.json").exists():
-        record = [sys.executable, "-m", "station.cli", "record-virtual"]
-        options = ["--body", str(BODY), "--out", str(folder), "--frames", "12", "--passes", "150"]
-        subprocess.run([*record, *options], check=True, stdout=subprocess.DEVNULL)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def base() -> Path:
+def base(prepared: tuple[Future[Path], Future[Path]]) -> Path:
     """A minimal Debian with the package's dependencies and nothing of the booth."""
-    control = (ROOT / "deploy/package/body-booth/control").read_text()
-    (depends,) = re.findall(r"^Depends: (.*)$", control, re.MULTILINE)
-    names = [re.split(r"[ (|]", entry.strip())[0] for entry in depends.split(",")]
-    return base_root(_WORK / "debian", names)
+    assert prepared
+    return base_root(DEBIAN, dependencies_of_package())
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +72,10 @@ def machine(base: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ma
         yield made
     finally:
         made.close()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the bars."""
+    TABLE.add("the whole suite", time.monotonic() - _BEGAN_S, _SUITE_BAR_S)
+    terminalreporter.section("bars")
+    terminalreporter.write_line(str(TABLE))

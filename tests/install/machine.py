@@ -1,6 +1,6 @@
 """A fresh Debian machine under systemd-nspawn: systemd as PID 1, its own network and no way out.
 
-Its root is an overlay on one that debootstrap made once. Killing PID 1 is the closest to a reset
+Its root is an overlay on one that is made once. Killing PID 1 is the closest to a reset
 that a container has: every process dies at once, but what the kernel holds in memory still reaches
 the disk.
 """
@@ -8,21 +8,14 @@ the disk.
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import time
 from pathlib import Path
 
-MIRROR = "http://deb.debian.org/debian"
-SUITE = "bookworm"
+from install.debian_root import ENVIRONMENT
+
 _CGROUPS = Path("/sys/fs/cgroup")
-_ENVIRONMENT = (
-    "PATH=/usr/sbin:/usr/bin:/sbin:/bin",
-    "TERM=dumb",
-    "LANG=C.UTF-8",
-    "DEBIAN_FRONTEND=noninteractive",
-)
 _BOOT_S = 60.0
 _COMMAND_S = 900.0
 # systemd wants the unified hierarchy for itself; a host with the old one has it as well, but
@@ -34,31 +27,6 @@ mount -t cgroup2 none /sys/fs/cgroup
 shift
 exec "$@"
 """
-
-
-def base_root(folder: Path, packages: list[str]) -> Path:
-    """A minimal Debian with what the booth's package depends on; made once for each list."""
-    root, mark = folder / "root", folder / "packages.txt"
-    wanted = " ".join(sorted(packages))
-    if mark.exists() and mark.read_text() == wanted:
-        return root
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    base = "systemd,systemd-sysv,dbus,udev,man-db"
-    subprocess.run(
-        ["debootstrap", "--variant=minbase", f"--include={base}", SUITE, str(root), MIRROR],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    shutil.copy("/etc/resolv.conf", root / "etc/resolv.conf")
-    install = ["apt-get", "install", "-y", "-q", "--no-install-recommends", *packages]
-    subprocess.run(
-        ["chroot", str(root), "env", *_ENVIRONMENT, *install],
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    mark.write_text(wanted)
-    return root
 
 
 class Machine:
@@ -133,7 +101,7 @@ class Machine:
 
     def _inside(self, words: tuple[str, ...]) -> list[str]:
         enter = ["nsenter", "-t", str(self._leader), "-m", "-u", "-i", "-n", "-p", "-C"]
-        return [*enter, "--", "env", "-i", *_ENVIRONMENT, *words]
+        return [*enter, "--", "env", "-i", *ENVIRONMENT, *words]
 
     def put(self, source: Path, target: str, *, owner: str = "root") -> None:
         """Copy a file or folder onto its disk."""

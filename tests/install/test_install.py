@@ -14,22 +14,17 @@ from pathlib import Path
 
 import pytest
 
+from install.bars import TABLE
 from install.machine import Machine
 
 STATE = "/var/lib/booth"
-RECORDINGS = f"{STATE}/recordings"
 _DELIVERED = (0, 3)
 """`station scan`: a result, or a result that says to scan again."""
 _RESTART_BAR_S, _BOOT_BAR_S, _FIRST_SCAN_BAR_S, _SIZE_BAR_MB = 3.0, 15.0, 120.0, 250.0
 _EXPOSURE_BAR = 1.5
 
 
-def _report(what: str, value: float, bar: float, unit: str = "s") -> None:
-    word = "met" if value <= bar else "missed"
-    print(f"  {what:<44} {value:8.1f} {unit:<3} bar {bar:g} {unit}: {word}")
-
-
-def _until(true: Callable[[], bool], what: str, limit_s: float = 90.0) -> float:
+def _until(true: Callable[[], bool], what: str, limit_s: float = 300.0) -> float:
     """Wait; returns how long it took."""
     began_s = time.monotonic()
     while not true():
@@ -97,24 +92,21 @@ def untouched(machine: Machine) -> set[str]:
 
 
 def test_three_commands_lead_to_the_first_scan(
-    machine: Machine, untouched: set[str], package: Path, recordings: Path
+    machine: Machine, untouched: set[str], package: Path
 ) -> None:
     assert "usr/bin/station" not in untouched
     machine.put(package, f"/root/{package.name}")
     began_s = time.monotonic()
     machine.run("apt-get", "install", "-y", f"/root/{package.name}")
-    installed_s = time.monotonic() - began_s
-    machine.put(recordings, RECORDINGS, owner="booth:")
-    began_s = time.monotonic()
-    setup = machine.run("station", "setup", "--recordings", RECORDINGS)
+    setup = machine.run("station", "setup", "--virtual")
     assert "the console's password, shown only once" in setup.stdout
     assert "ready: station scan" in setup.stdout
-    _scan(machine, "first")
-    seconds = installed_s + time.monotonic() - began_s
-    print()
-    _report("from apt install to the first scan", seconds, _FIRST_SCAN_BAR_S)
+    scan = _scan(machine, "first")
+    TABLE.add("from apt install to the first scan", time.monotonic() - began_s, _FIRST_SCAN_BAR_S)
+    for field in (f"SCAN={scan}", "CAMERA=front-upper"):
+        assert machine.run("journalctl", "-q", "-o", "cat", field).stdout.strip(), field
     size = machine.run("dpkg-query", "-W", "-f", "${Installed-Size}", "body-booth").stdout
-    _report("installed size", int(size) / 1000, _SIZE_BAR_MB, "MB")
+    TABLE.add("installed size", int(size) / 1000, _SIZE_BAR_MB, "MB")
 
 
 def test_setup_again_changes_nothing(machine: Machine) -> None:
@@ -140,12 +132,11 @@ def test_systemd_finds_nothing_wrong_with_the_installed_units(machine: Machine) 
     verified = machine.run("systemd-analyze", "verify", *names)
     assert verified.stdout + verified.stderr == ""
     services = [name for name in names if name.endswith(".service")]
-    print()
     for unit in services:
         words = machine.run("systemd-analyze", "--no-pager", "security", unit).stdout
         found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", words)
         assert found, words
-        _report(f"exposure of {unit}", float(found[1]), _EXPOSURE_BAR, "")
+        TABLE.add(f"exposure of {unit}", float(found[1]), _EXPOSURE_BAR, "")
         assert float(found[1]) <= _EXPOSURE_BAR
 
 
@@ -159,12 +150,11 @@ def test_manuals_and_completion_are_there(machine: Machine) -> None:
 
 
 def test_a_killed_process_comes_back(machine: Machine) -> None:
-    print()
     for unit in _services(machine):
         restarts = int(_shown(machine, unit)["NRestarts"])
         machine.run("systemctl", "kill", "-s", "KILL", "--kill-whom=main", unit)
         seconds = _until(lambda u=unit, n=restarts: _is_back(machine, u, n), unit)  # type: ignore[misc]
-        _report(f"{unit} back after kill -9", seconds, _RESTART_BAR_S)
+        TABLE.add(f"{unit} back after kill -9", seconds, _RESTART_BAR_S)
     _ready(machine)
     _scan(machine, "after kill -9")
 
@@ -176,13 +166,12 @@ def test_a_process_that_hangs_is_started_anew(machine: Machine) -> None:
     began_s = time.monotonic()
     for unit in units:
         machine.run("systemctl", "kill", "-s", "STOP", "--kill-whom=main", unit)
-    print()
     for unit in units:
         restarts = int(before[unit]["NRestarts"])
         _until(lambda u=unit, n=restarts: _is_back(machine, u, n), unit)  # type: ignore[misc]
         watchdog_s = float(before[unit]["WatchdogUSec"].removesuffix("s"))
         seconds = time.monotonic() - began_s
-        _report(f"{unit} back after SIGSTOP", seconds, 2 * watchdog_s + _RESTART_BAR_S)
+        TABLE.add(f"{unit} back after SIGSTOP", seconds, 2 * watchdog_s)
     _ready(machine)
     _scan(machine, "after SIGSTOP")
 
@@ -204,8 +193,7 @@ def test_a_reset_loses_no_accepted_scan(machine: Machine, moment: str) -> None:
     began_s = time.monotonic()
     machine.boot()
     _ready(machine)
-    print()
-    _report("from power on to ready to scan", time.monotonic() - began_s, _BOOT_BAR_S)
+    TABLE.add("from power on to ready to scan", time.monotonic() - began_s, _BOOT_BAR_S)
     _until(lambda: accepted <= _outbox(machine), "accepted scans are delivered")
     for scan_id in _outbox(machine):
         folder = machine.root / STATE.lstrip("/") / "spool/outbox" / scan_id
@@ -242,7 +230,7 @@ def test_an_unknown_layout_is_refused_and_the_booth_goes_on(
 
 
 def test_a_backup_makes_another_machine_the_same_booth(
-    machine: Machine, base: Path, package: Path, tmp_path: Path, recordings: Path
+    machine: Machine, base: Path, package: Path, tmp_path: Path
 ) -> None:
     machine.run("systemctl", "stop", "booth.target")
     machine.run("station", "backup", "/root/usb", "--with-scans")
@@ -252,7 +240,6 @@ def test_a_backup_makes_another_machine_the_same_booth(
         other.boot()
         other.put(package, f"/root/{package.name}")
         other.run("apt-get", "install", "-y", f"/root/{package.name}")
-        other.put(recordings, RECORDINGS, owner="booth:")
         other.put(machine.root / "root/usb", "/root/usb")
         (saved,) = (other.root / "root/usb").iterdir()
         other.run("station", "restore", f"/root/usb/{saved.name}")
