@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
+# Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
+# share, and files begin in their order, the long ones of tests/accuracy first.
+PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
 
 .PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
@@ -27,7 +30,7 @@ demo: $(VENV)/runtime.stamp
 	$(BIN)/python deploy/demo.py --folder $(DEMO)
 
 test: $(VENV)/train.stamp
-	$(BIN)/python -m pytest --durations=20
+	$(BIN)/python -m pytest $(PARALLEL) --durations=20
 
 test-faults: $(VENV)/dev.stamp
 	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py $(ARGS)

@@ -64,11 +64,15 @@ class Row:
 
 def calibrate(seed: int) -> Row | str:
     """Simulate, solve and judge one booth; words if it is refused."""
-    booth = synthetic.booth(seed)
-    procedure = VirtualProcedure(booth)
-    cameras = synthetic.factory(booth.rig)
+    procedure = VirtualProcedure(synthetic.booth(seed))
+    cameras = synthetic.factory(procedure.booth.rig)
     seen = [simulate(procedure, camera) for camera in cameras.values()]
-    observations = Observations.merged(seen)
+    return judged(procedure, Observations.merged(seen))
+
+
+def judged(procedure: VirtualProcedure, observations: Observations) -> Row | str:
+    """Solve and judge a booth from its detections; words if it is refused."""
+    booth, cameras = procedure.booth, synthetic.factory(procedure.booth.rig)
     start_s = time.perf_counter()
     try:
         solution = solve(
@@ -76,7 +80,7 @@ def calibrate(seed: int) -> Row | str:
             front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
         )  # fmt: skip
     except CalibrationError as refusal:
-        return f"{seed:<7}refused: {refusal}"
+        return f"{booth.seed:<7}refused: {refusal}"
     seconds = time.perf_counter() - start_s
     names, truth = list(cameras), booth.rig.cameras
     errors = []
@@ -100,7 +104,7 @@ def calibrate(seed: int) -> Row | str:
         body_mm, body_true_mm = _body(booth, solution.rig, Path(folder) / "body")
     twists = np.array(errors)
     return Row(
-        seed,
+        booth.seed,
         1e3 * np.linalg.norm(twists[:, 3:], axis=1),
         np.degrees(np.linalg.norm(twists[:, :3], axis=1)),
         float(away @ np.linalg.solve(covariance, away)),
