@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse
 
 from station.archive.bundle_zip import MEDIA_TYPES, result_zip
 from station.archive.compare import compare_rows, compare_surfaces
+from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
 from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows
@@ -31,7 +33,7 @@ UnitQuery = Annotated[Unit, Query()]
 LanguageQuery = Annotated[Language, Query()]
 
 
-def _open(console: Console, caller: Caller, scan_id: str, what: str) -> tuple[Any, Path]:
+def _open(console: Console, caller: Caller, scan_id: str, what: str) -> tuple[ScanRecord, Path]:
     record, folder = console.result(scan_id)
     console.audit.note(caller.name, caller.address, f"read {what}", scan_id)
     return record, folder
@@ -117,26 +119,43 @@ def _words(part: str) -> str:
     return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
 
 
-@router.get("/measurements", responses=responses(404, 409))
-def measurements(
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A scan's table of measurements as a request selects it."""
+
+    record: ScanRecord
+    document: dict[str, Any]
+    pose: Pose
+    unit: Unit
+    language: Language
+
+
+def _selected(
     scan_id: ScanId,
     console: Booth,
     caller: Reader,
     pose: PoseQuery = "as-scanned",
     unit: UnitQuery = "cm",
     language: LanguageQuery = "en",
-) -> Measurements:
-    """The table, each row with its 95 % interval."""
+) -> _Table:
     record, folder = _open(console, caller, scan_id, "measurements")
-    table = rows(read_measurements(folder, pose), unit, language)
+    return _Table(record, read_measurements(folder, pose), pose, unit, language)
+
+
+Selected = Annotated[_Table, Depends(_selected)]
+
+
+@router.get("/measurements", responses=responses(404, 409))
+def measurements(table: Selected) -> Measurements:
+    """The table, each row with its 95 % interval."""
     return Measurements(
-        scan_id=scan_id,
-        label=record.label,
-        verdict=record.verdict,
-        created=record.created,
-        pose=pose,
-        unit=unit,
-        rows=table,  # type: ignore[arg-type]  # pydantic reads them
+        scan_id=table.record.scan_id,
+        label=table.record.label,
+        verdict=table.record.verdict,
+        created=table.record.created,
+        pose=table.pose,
+        unit=table.unit,
+        rows=rows(table.document, table.unit, table.language),  # type: ignore[arg-type]
     )
 
 
@@ -153,18 +172,11 @@ def _attached(content: bytes, media: str, name: str) -> Response:
 @router.get(
     "/measurements.csv", response_class=Response, responses=_document("text/csv", "The table")
 )
-def measurements_csv(
-    scan_id: ScanId,
-    console: Booth,
-    caller: Reader,
-    pose: PoseQuery = "as-scanned",
-    unit: UnitQuery = "cm",
-    language: LanguageQuery = "en",
-) -> Response:
+def measurements_csv(table: Selected) -> Response:
     """The table for a spreadsheet."""
-    record, folder = _open(console, caller, scan_id, "measurements")
-    table = csv_table(record, read_measurements(folder, pose), unit, language)
-    return _attached(table.encode(), "text/csv", f"{scan_id}-{pose}-{unit}.csv")
+    text = csv_table(table.record, table.document, table.unit, table.language)
+    name = f"{table.record.scan_id}-{table.pose}-{table.unit}.csv"
+    return _attached(text.encode(), "text/csv", name)
 
 
 @router.get(
