@@ -19,7 +19,7 @@ SITE = Path("lib/python3.11/site-packages")
 
 _NOT_SHIPPED = ("tests", "test")
 _NOT_SHIPPED_FILES = ("*.pyi", "*.h", "*.hpp", "*.cuh", "*.pxd", "*.pyx", "*.a", "*.lib")
-_COMPILE = ("-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash")
+_COMPILE = ("-m", "compileall", "-q", "-f", "--invalidation-mode", "unchecked-hash")
 _LAUNCHER = """#!/opt/booth/bin/python -I
 import sys
 

@@ -122,7 +122,7 @@ def _merged(path: str) -> str:
 
 def _configure(root: Path) -> None:
     """Do what the packages' scripts would: accounts, alternatives, the linker's cache."""
-    for folder in ("dev", "proc", "sys", "run", "root", "var/lib/apt/lists", "var/log"):
+    for folder in ("dev", "proc", "sys", "run", "root", "opt", "srv", "media", "var/lib/apt/lists"):
         (root / folder).mkdir(parents=True, exist_ok=True)
     (root / "tmp").chmod(0o1777)
     for name in ("passwd", "group"):
