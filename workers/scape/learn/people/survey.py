@@ -19,8 +19,9 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.measure.definitions import DEFINITIONS, TRUNK
+from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import Definition, Level, Route, Section, Tilted
+from workers.measure.vocabulary import TRUNK
 
 Array = NDArray[np.float64]
 
