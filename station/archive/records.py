@@ -9,7 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from station.core.spool import REASON, Spool
+from station.core.scans import REASON
+from station.core.spool import Spool
 
 ScanState = Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]
 PLACES: dict[str, ScanState] = {

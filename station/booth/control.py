@@ -35,9 +35,9 @@ from station.booth.session import CANCELLED, UNSURE, Session, overdue, state_of
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
-from station.core.scans import ScanId, ScanNote, boot_id, scan_id_of
+from station.core.scans import ScanId, ScanNote, boot_id, failure_reason, scan_id_of
 from station.core.service import Heartbeat, only_process, stop_event
-from station.core.spool import Spool, failure_reason
+from station.core.spool import Spool
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
 from station.messaging.transport import ask, dealer, publisher, server, subscriber

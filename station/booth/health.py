@@ -13,8 +13,8 @@ from typing import Any
 
 from station.booth.supervisor import services
 from station.core.config import BoothConfig
+from station.core.scans import STATES, count_scans
 from station.core.service import read_health
-from station.core.spool import STATES, count_scans
 
 MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""

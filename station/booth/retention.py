@@ -20,8 +20,8 @@ from station.archive.index import ScanIndex
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import held, read_bounded_json, write_json
-from station.core.scans import ScanId, boot_id, scan_id_of
-from station.core.spool import STATES, Spool
+from station.core.scans import STATES, ScanId, boot_id, scan_id_of
+from station.core.spool import Spool
 
 FILE = "retention.json"
 LONGEST_OFF_S = 4 * 86_400.0

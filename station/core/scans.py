@@ -1,4 +1,12 @@
-"""Scan ids, and the note that is kept of each scan outside its bundle and result.
+"""Scans on disk: their ids, their notes, and the folders of their bundles and results.
+
+    tmp/       being written
+    scans/     a note of each scan
+    queue/     accepted scans (bundles)
+    work/      claimed by a worker (`station.core.spool`)
+    outbox/    results, complete or not at all
+    failed/    bundles that could not be reconstructed, with reason.json
+    done/      bundles of delivered scans, until retention removes them
 
 A note (`spool/scans/<scan id>.json`) records the order and its outcome. It is written before the
 step that it describes, by one process at a time:
@@ -10,27 +18,36 @@ step that it describes, by one process at a time:
     worker    delivered   it has it: from here on the result may be moved away
     worker    failed      no reconstruction
 
-Where a scan's bundle and result lie (`station.core.spool`) takes precedence over its note. A note
+Where a scan's bundle and result are takes precedence over its note. A note
 stays until the retention period ends, so that no scan is delivered twice.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
+import shutil
+import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NewType, get_args
 
-from station.core.errors import InputError
-from station.core.files import private_folder, read_bounded_json, write_json
+from station.core.errors import InputError, SpoolError
+from station.core.files import private_folder, publish_folder, read_bounded_json, write_json
 
 ScanId = NewType("ScanId", str)
 """A scan's id: 1 to 64 letters, digits, '-' and '_'. It names folders, so nothing else may."""
 _SCAN_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _MAX_NOTE_BYTES = 1 << 16
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+STATES = ("queue", "work", "outbox", "failed", "done")
+REASON = "reason.json"
+_BUNDLE_BYTES = 40 << 20
+"""Larger than a bundle of forty depth frames."""
 
 Stage = Literal["armed", "capturing", "accepted", "delivering", "delivered", "failed"]
 
@@ -142,3 +159,107 @@ def _note(document: Any, scan_id: ScanId) -> ScanNote:
     if not all(isinstance(value, _TYPES.get(key, str)) for key, value in values.items()):
         raise ValueError("a field of the scan's note has another type")
     return ScanNote(scan_id=scan_id, **values)
+
+
+class ScanFolders:
+    """The folders of one spool and what is in them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in ("tmp", *STATES):
+            private_folder(folder / name)
+        self.notes = Notes(folder / "scans")
+
+    def path(self, state: str, scan_id: str) -> Path:
+        return self.folder / state / scan_id
+
+    def temporary(self, name: str) -> Path:
+        """A new name in the spool's own file system; the caller makes the folder."""
+        return self.folder / "tmp" / f"{name}.{os.getpid()}.{time.monotonic_ns()}"
+
+    def check_space(self, min_free_mb: float) -> None:
+        """Refuse a scan before it is taken, rather than lose it after.
+
+        Raises:
+            SpoolError: naming the folder and the space that is missing, or why it takes no files.
+        """
+        free = shutil.disk_usage(self.folder).free
+        needed = min_free_mb * 1e6 + _BUNDLE_BYTES
+        if free < needed:
+            raise SpoolError(
+                f"{self.folder} has {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB are needed "
+                "(spool.min_free_mb); free some space or run: station purge --old"
+            )
+
+    def where(self, scan_id: str) -> str | None:
+        """The state of a scan, or None if it is in none of the folders.
+
+        Folders are looked through against the order in which a scan passes them, and once more: a
+        scan that is being renamed is in one of them at any moment, but not always in the one that
+        is looked at.
+        """
+        for _ in range(2):
+            for state in ("outbox", "failed", "work", "queue"):
+                if self.path(state, scan_id).exists():
+                    return state
+        return None
+
+    def note(self, scan_id: ScanId) -> ScanNote:
+        """The note of a scan; of one that came without an order, a new one."""
+        return self.notes.read(scan_id) or ScanNote(scan_id, "accepted")
+
+    def submit(self, temporary: Path, scan_id: str) -> None:
+        """Accept a finished bundle: from here on nothing short of losing the disk loses it.
+
+        The same scan twice is one scan, also after its result was moved away.
+
+        Raises:
+            SpoolError: the id cannot name a scan.
+            OSError: the disk refused; `where` tells whether the scan was accepted all the same.
+        """
+        if not is_scan_id(scan_id):
+            raise SpoolError(f"{scan_id!a:.80} is not a valid scan id; the bundle is not accepted")
+        note = self.notes.read(ScanId(scan_id))
+        known = note is not None and note.stage in ("delivering", "delivered")
+        if known or self.where(scan_id) is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+            return
+        publish_folder(temporary, self.path("queue", scan_id))
+
+    def waiting(self) -> list[ScanId]:
+        """Scan ids in the queue, oldest first; other folders are ignored."""
+        return self.scans_in("queue")
+
+    def scans_in(self, state: str) -> list[ScanId]:
+        """Scan ids in one of the folders, oldest first."""
+        with os.scandir(self.folder / state) as entries:
+            return sorted(
+                ScanId(entry.name)
+                for entry in entries
+                if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
+            )
+
+    def all_scans(self) -> Iterator[tuple[str, Path]]:
+        """All scans: (state, folder)."""
+        for state in STATES:
+            for entry in sorted((self.folder / state).iterdir()):
+                yield state, entry
+
+
+def count_scans(folder: Path) -> dict[str, int]:
+    """State -> how many scans of a spool are in it; read-only.
+
+    Raises:
+        OSError: the spool belongs to another user.
+    """
+    found = {state: folder / state for state in STATES if (folder / state).is_dir()}
+    counts = {state: len(list(place.iterdir())) for state, place in found.items()}
+    return {state: count for state, count in counts.items() if count}
+
+
+def failure_reason(folder: Path) -> str:
+    """Reason why the bundle in a folder of failed/ was given up."""
+    try:
+        return str(read_bounded_json(folder / REASON, 1 << 16)["reason"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "unknown; see the workers' log"

@@ -1,16 +1,8 @@
-"""The spool: where scans wait, are worked on and are delivered. The disk is the single source of
-truth.
+"""Work on the scans of a spool: claims, deliveries, recovery after a worker died.
 
-    tmp/       being written
-    scans/     notes of scans (`station.core.scans`)
-    queue/     accepted scans (bundles)
-    work/      claimed by a worker
-    outbox/    results, whole or not at all
-    failed/    bundles that could not be reconstructed, with reason.json
-    done/      bundles of delivered scans, until retention removes them
-
-A worker claims a scan by a file lock and a rename. The lock of a dead process is released, and any
-other worker puts the scan back. Locks and renames need one local file system.
+A worker claims a scan by a file lock and a rename from `queue/` into `work/`. The lock of a dead
+process is released, and any other worker puts the scan back. Locks and renames need one local file
+system. The folders are described in `station.core.scans`.
 """
 
 from __future__ import annotations
@@ -20,120 +12,28 @@ import fcntl
 import logging
 import os
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from station.core.errors import SpoolError
-from station.core.files import (
-    fsync_folder,
-    private_folder,
-    publish_folder,
-    read_bounded_json,
-    write_json,
-)
-from station.core.scans import Notes, ScanId, ScanNote, Stage, boot_id, is_scan_id
+from station.core.files import fsync_folder, private_folder, publish_folder, write_json
+from station.core.scans import REASON, ScanFolders, ScanId, ScanNote, Stage, boot_id, is_scan_id
 
-STATES = ("queue", "work", "outbox", "failed", "done")
-REASON = "reason.json"
 MAX_DEATHS = 10
 """Ends of the station, unlike those of a job, do not count as tries of a scan; a scan during which
 the station ends this often is given up."""
-_BUNDLE_BYTES = 40 << 20
-"""Larger than a bundle of forty depth frames."""
 _LOG = logging.getLogger("spool")
 
 
-def count_scans(folder: Path) -> dict[str, int]:
-    """State -> how many scans of a spool are in it; read-only.
-
-    Raises:
-        OSError: the spool belongs to another user.
-    """
-    found = {state: folder / state for state in STATES if (folder / state).is_dir()}
-    counts = {state: len(list(place.iterdir())) for state, place in found.items()}
-    return {state: count for state, count in counts.items() if count}
-
-
-class Spool:
-    """The folders of one spool."""
+class Spool(ScanFolders):
+    """One spool, whose scans are claimed, delivered and recovered."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        for name in ("tmp", "locks", *STATES):
-            private_folder(folder / name)
-        self.notes = Notes(folder / "scans")
+        super().__init__(folder)
+        private_folder(folder / "locks")
         self.released: set[ScanId] = set()
         """Claims that this process dropped: their worker did not die."""
-
-    def path(self, state: str, scan_id: str) -> Path:
-        return self.folder / state / scan_id
-
-    def temporary(self, name: str) -> Path:
-        """A new name in the spool's own file system; the caller makes the folder."""
-        return self.folder / "tmp" / f"{name}.{os.getpid()}.{time.monotonic_ns()}"
-
-    def check_space(self, min_free_mb: float) -> None:
-        """Refuse a scan before it is taken, rather than lose it after.
-
-        Raises:
-            SpoolError: naming the folder and the space that is missing, or why it takes no files.
-        """
-        free = shutil.disk_usage(self.folder).free
-        needed = min_free_mb * 1e6 + _BUNDLE_BYTES
-        if free < needed:
-            raise SpoolError(
-                f"{self.folder} has {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB are needed "
-                "(spool.min_free_mb); free some space or run: station purge --old"
-            )
-
-    def where(self, scan_id: str) -> str | None:
-        """The state of a scan, or None if it is in none of the folders.
-
-        Folders are looked through against the order in which a scan passes them, and once more: a
-        scan that is being renamed is in one of them at any moment, but not always in the one that
-        is looked at.
-        """
-        for _ in range(2):
-            for state in ("outbox", "failed", "work", "queue"):
-                if self.path(state, scan_id).exists():
-                    return state
-        return None
-
-    def note(self, scan_id: ScanId) -> ScanNote:
-        """The note of a scan; of one that came without an order, a new one."""
-        return self.notes.read(scan_id) or ScanNote(scan_id, "accepted")
-
-    def submit(self, temporary: Path, scan_id: str) -> None:
-        """Accept a finished bundle: from here on nothing short of losing the disk loses it.
-
-        The same scan twice is one scan, also after its result was moved away.
-
-        Raises:
-            SpoolError: the id cannot name a scan.
-            OSError: the disk refused; `where` tells whether the scan was accepted all the same.
-        """
-        if not is_scan_id(scan_id):
-            raise SpoolError(f"{scan_id!a:.80} is not a valid scan id; the bundle is not accepted")
-        note = self.notes.read(ScanId(scan_id))
-        known = note is not None and note.stage in ("delivering", "delivered")
-        if known or self.where(scan_id) is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-            return
-        publish_folder(temporary, self.path("queue", scan_id))
-
-    def waiting(self) -> list[ScanId]:
-        """Scan ids in the queue, oldest first; other folders are ignored."""
-        return self._scans_in("queue")
-
-    def _scans_in(self, state: str) -> list[ScanId]:
-        with os.scandir(self.folder / state) as entries:
-            return sorted(
-                ScanId(entry.name)
-                for entry in entries
-                if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
-            )
 
     def claim(self) -> Claim | None:
         """Claim the oldest waiting scan.
@@ -212,7 +112,7 @@ class Spool:
         that cannot be moved is left for the next call.
         """
         back = []
-        for scan_id in self._scans_in("work"):
+        for scan_id in self.scans_in("work"):
             try:
                 lock = self.lock(scan_id)
                 if lock is None:
@@ -253,16 +153,10 @@ class Spool:
 
     def sweep(self) -> None:
         """Remove leftovers of dead writers, except those that a delivery still needs."""
-        needed = {note.result for scan_id in self._scans_in("work") if (note := self.note(scan_id))}
+        needed = {note.result for scan_id in self.scans_in("work") if (note := self.note(scan_id))}
         for entry in (self.folder / "tmp").iterdir():
             if entry.name not in needed and not _writer_lives(entry.name):
                 shutil.rmtree(entry, ignore_errors=True)
-
-    def all_scans(self) -> Iterator[tuple[str, Path]]:
-        """All scans: (state, folder)."""
-        for state in STATES:
-            for entry in sorted((self.folder / state).iterdir()):
-                yield state, entry
 
     def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""
@@ -279,6 +173,7 @@ class Spool:
                 os.close(descriptor)
                 return None
             except FileNotFoundError:
+                # Its holder removed the file between the two calls: try again with a new file.
                 pass
             except OSError:
                 os.close(descriptor)
@@ -381,11 +276,3 @@ class Claim:
         os.rename(self.bundle, target)
         fsync_folder(target.parent)
         self.close()
-
-
-def failure_reason(folder: Path) -> str:
-    """Reason why the bundle in a folder of failed/ was given up."""
-    try:
-        return str(read_bounded_json(folder / REASON, 1 << 16)["reason"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "unknown; see the workers' log"

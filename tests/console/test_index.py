@@ -13,7 +13,8 @@ from station.archive.records import ScanRecord
 from station.booth.retention import purge
 from station.cli import station
 from station.core.files import write_json
-from station.core.spool import REASON, Spool
+from station.core.scans import REASON
+from station.core.spool import Spool
 
 
 @pytest.fixture

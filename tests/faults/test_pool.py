@@ -12,8 +12,8 @@ import pytest
 
 from station.booth.retention import FILE, Moment, expire_old, purge_scan
 from station.core.config import RetentionConfig
-from station.core.scans import ScanId, ScanNote
-from station.core.spool import REASON, Spool
+from station.core.scans import REASON, ScanId, ScanNote
+from station.core.spool import Spool
 
 _DAY_S = 86_400.0
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from station.core.errors import SpoolError
-from station.core.scans import ScanId
-from station.core.spool import MAX_DEATHS, Spool, failure_reason
+from station.core.scans import ScanId, failure_reason
+from station.core.spool import MAX_DEATHS, Spool
 
 
 def _submit(spool: Spool, scan_id: str) -> None:
