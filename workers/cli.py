@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from station import __version__
-from station.core.lazy_group import LazyGroup, run
+from station.core.commands import LazyGroup, run
 
 COMMANDS = {
     "fit": ("workers.reconstruct.fit_cli:fit", "reconstruct one scan bundle or point cloud"),

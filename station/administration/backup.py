@@ -9,13 +9,14 @@ import click
 
 from station.administration import units
 from station.administration.archive import check, save
+from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.errors import BoothError
 
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option("--with-scans", is_flag=True, help="also scans and results (personal data)")
 def backup(folder: Path, config_path: Path | None, with_scans: bool) -> None:
     """Save configuration, calibrations and other data of the booth into FOLDER.

@@ -12,13 +12,14 @@ from station.administration.archive import CONTENT, Part, check, part, restore_p
 from station.administration.booth_file import CONFIG, STATE_FOLDER
 from station.administration.migrate import migrate
 from station.administration.ownership import USER, give_to_booth, is_installed_root
+from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.errors import BoothError, ConfigError
 
 
 @click.command()
 @click.argument("backup", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def restore(backup: Path, config_path: Path | None) -> None:
     """Restore what `station backup` saved in BACKUP; the booth must be stopped.
 

@@ -28,6 +28,7 @@ from station.administration.connected import (
 )
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.console.security.vault import Vault
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.drivers import CameraConfig
 from station.core.errors import BoothError, ConfigError, DriverError
@@ -44,7 +45,7 @@ _UNREADABLE = ("/home", "/root", "/tmp", "/run/user")
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option("--camera", "pairs", multiple=True, metavar="NAME=SERIAL", help="name a sensor")
 @click.option(
     "--recordings",

@@ -10,6 +10,7 @@ import click
 
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
+from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.spool import Spool
 
@@ -23,7 +24,7 @@ _WORDS = {
 
 
 @click.command("list")
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
 @click.option(
     "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
@@ -43,7 +44,7 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
 
 @click.command()
 @click.argument("text")
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option(
     "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import zmq
 
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import DriverError, FormatError
 from station.core.service import Heartbeat, only_process, stop_event
@@ -202,7 +203,7 @@ class CaptureProcess:
 
 @click.command()
 @click.argument("camera")
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def capture(camera: str, config_path: Path | None) -> None:
     """Read one sensor and publish its frames; `station run` starts one for each camera.
 

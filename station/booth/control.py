@@ -32,6 +32,7 @@ from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
 from station.booth.retention import expire_old
 from station.booth.session import CANCELLED, UNSURE, Session, overdue, state_of
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
@@ -257,7 +258,7 @@ class ControlProcess:
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def control(config_path: Path | None) -> None:
     """Answer the operator's commands; `station run` starts it.
 

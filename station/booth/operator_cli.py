@@ -14,6 +14,7 @@ import click
 
 from station.booth.health import MAX_AGE_S, booth_health
 from station.booth.session import FINAL, ON_DISK, UNSURE
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
@@ -33,10 +34,6 @@ _WORDS = {
     "accepted": "scan accepted: the person may leave",
     "reconstructing": "reconstructing",
 }
-
-config_option = click.option(
-    "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
-)
 
 
 def _command(config: BoothConfig, request: Request) -> dict[str, Any]:

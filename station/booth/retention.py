@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from station.archive.index import ScanIndex
+from station.core.commands import config_option
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import held, read_bounded_json, write_json
@@ -192,7 +193,7 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
 
 @click.command()
 @click.argument("scan_id", required=False)
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option("--label", help="delete all scans with exactly this label")
 @click.option("--old", is_flag=True, help="remove everything past its retention period")
 def purge(scan_id: str | None, config_path: Path | None, label: str | None, old: bool) -> None:
@@ -230,7 +231,7 @@ def _purge_label(spool: Spool, label: str) -> list[Path]:
 
 @click.command()
 @click.argument("scan_id")
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def retry(scan_id: str, config_path: Path | None) -> None:
     """Reconstruct a failed scan again.
 

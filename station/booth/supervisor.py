@@ -19,6 +19,7 @@ from pathlib import Path
 
 import click
 
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import held, private_folder
@@ -176,7 +177,7 @@ def supervise(table: list[Service], config_path: Path, folder: Path, stop: threa
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def run(config_path: Path | None) -> None:
     """Run the whole booth in the foreground until Ctrl-C; an installed booth uses systemd instead.
 

@@ -20,6 +20,7 @@ from station.booth.scan_writer import Ended, ScanWriter, Started
 from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.scans import ScanId, scan_id_of
@@ -268,7 +269,7 @@ class SyncProcess:
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def sync(config_path: Path | None) -> None:
     """Match the cameras' frames and write scans; `station run` starts it.
 

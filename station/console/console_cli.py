@@ -9,12 +9,9 @@ import click
 
 from station.console.security.certificate import make_certificate
 from station.console.security.vault import SCOPES, Scope, Vault
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.service import set_up_logs, stop_event
-
-config_option = click.option(
-    "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
-)
 
 
 @click.command()

@@ -12,6 +12,7 @@ import click
 
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.service import Heartbeat, only_process, stop_event
@@ -131,7 +132,7 @@ class HandOver:
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def deliver(config_path: Path | None) -> None:
     """Hand results over to the programs of [[deliver]]; `station run` starts it.
 

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from station import cli as station_cli
-from station.core.lazy_group import LazyGroup
+from station.core.commands import LazyGroup
 from workers import cli as workers_cli
 
 _ALL = [

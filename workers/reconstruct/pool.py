@@ -16,6 +16,7 @@ from pathlib import Path
 
 import click
 
+from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.files import private_folder
 from station.core.scans import ScanId
@@ -178,7 +179,7 @@ def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 def work(config_path: Path | None) -> None:
     """Reconstruct the scans in the spool's queue as they come.
 

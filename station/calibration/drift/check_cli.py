@@ -13,6 +13,7 @@ from station.calibration.drift.motion import CameraMove, DriftReference, estimat
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
+from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
@@ -25,7 +26,7 @@ _SAME_SHARE = 0.97
 
 
 @click.command()
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+@config_option
 @click.option(
     "--recordings",
     type=click.Path(path_type=Path, exists=True, file_okay=False),

@@ -16,6 +16,7 @@ from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import FRONT, MARK, Lens, Session
 from station.calibration.guide.store import CalibrationStore
+from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
@@ -26,7 +27,7 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that all steps share; the command gets the procedure."""
 
-    @click.option("--config", "config_path", type=click.Path(path_type=Path), help="booth.toml")
+    @config_option
     @click.option(
         "--recordings",
         type=click.Path(path_type=Path, exists=True, file_okay=False),

@@ -1,10 +1,14 @@
-"""A command group that imports a subcommand only when it is called, so that --help stays quick."""
+"""Commands: the option that names the configuration, and a group whose --help stays quick.
+
+The group imports a subcommand only when it is called.
+"""
 
 from __future__ import annotations
 
 import importlib
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import click
@@ -12,6 +16,10 @@ import click
 from station.core.errors import BoothError
 from station.core.service import set_up_caches
 
+config_option = click.option(
+    "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
+)
+"""The configuration; without it `station.core.config.find_config` chooses."""
 _OPTIONAL = {
     "open3d": "this command needs open3d, which is not part of the basic installation: apt "
     "install body-booth-simulation, "
