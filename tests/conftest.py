@@ -5,10 +5,8 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from live_console import LiveConsole
 from running_station import STATION, Station
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
@@ -51,22 +49,3 @@ def make_station(booth: Path, tmp_path: Path) -> Iterator[Callable[[str], Statio
     yield make
     for station in running:
         station.close()
-
-
-@pytest.fixture(scope="session")
-def console(booth: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
-    """A station with a console, running, sensors on."""
-    live = LiveConsole(booth, tmp_path_factory.mktemp("console"))
-    try:
-        live.start_sensors()
-        yield live
-    finally:
-        live.close()
-
-
-@pytest.fixture(scope="session")
-def scans(console: LiveConsole) -> list[dict[str, Any]]:
-    """Two delivered scans of the console's station."""
-    found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
-    assert all(scan["state"] in ("delivered", "rescan") for scan in found), found
-    return found

@@ -1,0 +1,1 @@
+"""The console: index, exports, API and page, with a station of its own."""

@@ -1,0 +1,29 @@
+"""One station with a console for all tests of this folder; it ends with the last of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from live_console import LiveConsole
+
+
+@pytest.fixture(scope="package")
+def console(booth: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """A station with a console, running, sensors on."""
+    live = LiveConsole(booth, tmp_path_factory.mktemp("console"))
+    try:
+        live.start_sensors()
+        yield live
+    finally:
+        live.close()
+
+
+@pytest.fixture(scope="package")
+def scans(console: LiveConsole) -> list[dict[str, Any]]:
+    """Two delivered scans of the console's station."""
+    found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
+    assert all(scan["state"] in ("delivered", "rescan") for scan in found), found
+    return found
