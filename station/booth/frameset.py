@@ -13,6 +13,10 @@ Frame = TypeVar("Frame")
 _LONGEST_QUEUE = 20
 """Two thirds of a second: frames of one camera may come half a second after those of the others."""
 
+_SURE_SHARE = 0.6
+"""Of the tolerance, which is three quarters of a period at most: a set that is tighter than half a
+period cannot be made tighter by what the earliest camera may still send, so it need not wait."""
+
 
 @dataclass(frozen=True, slots=True)
 class Frameset(Generic[Frame]):
@@ -27,14 +31,16 @@ class Frameset(Generic[Frame]):
 class FramesetMatcher(Generic[Frame]):
     """Builds framesets in order; each frame is used at most once.
 
-    A set is complete when the heads of all queues lie within the tolerance and no camera's next
-    frame would make it tighter; the earliest head is dropped while they do not. Queues are short:
-    a camera that lags behind loses its own frames and uses no memory.
+    A set is complete when the heads of all queues lie within the tolerance and the next frame of
+    the earliest camera would not make it tighter; the earliest head is dropped while they do not.
+    Nothing is decided before the frames that it depends on are there, so the sets follow from the
+    frames' times alone, not from the order in which the cameras' frames come. Queues are short: a
+    camera that lags behind loses its own frames and uses no memory.
     """
 
     def __init__(self, cameras: Iterable[str], tolerance_s: float) -> None:
         self._queues: dict[str, deque[tuple[float, Frame]]] = {name: deque() for name in cameras}
-        self._tolerance_s = tolerance_s
+        self._tolerance_s, self._sure_s = tolerance_s, _SURE_SHARE * tolerance_s
         self._last_s: dict[str, float] = {}
         self.dropped: dict[str, int] = dict.fromkeys(self._queues, 0)
 
@@ -60,7 +66,10 @@ class FramesetMatcher(Generic[Frame]):
             heads = {name: waiting[0][0] for name, waiting in self._queues.items()}
             earliest = min(heads, key=heads.__getitem__)
             spread = max(heads.values()) - heads[earliest]
-            if spread <= self._tolerance_s and not self._tighter(earliest, heads, spread):
+            close = spread <= self._tolerance_s
+            if close and spread > self._sure_s and len(self._queues[earliest]) < 2:
+                break
+            if close and not self._tighter(earliest, heads, spread):
                 found.append(self._take(heads, spread))
             else:
                 self._queues[earliest].popleft()
@@ -74,7 +83,7 @@ class FramesetMatcher(Generic[Frame]):
 
     def _tighter(self, earliest: str, heads: dict[str, float], spread: float) -> bool:
         queue = self._queues[earliest]
-        if len(queue) < 2:
+        if spread <= self._sure_s or len(queue) < 2:
             return False
         times = [queue[1][0] if name == earliest else time for name, time in heads.items()]
         return max(times) - min(times) < spread

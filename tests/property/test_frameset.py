@@ -95,3 +95,38 @@ def test_late_doubled_and_lost_frames_cost_no_more_than_themselves(
     assert all(found.spread_s <= 0.025 for found in sets)
     assert [found.time_s for found in sets] == sorted(found.time_s for found in sets)
     assert len(sets) >= 88 - 2 * len(lost)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    phases=st.lists(st.floats(0.0, 1 / 30), min_size=4, max_size=4),
+    drifts=st.lists(st.floats(-500e-6, 500e-6), min_size=4, max_size=4),
+    lost=st.sets(st.tuples(st.integers(0, 3), st.integers(0, 59)), max_size=40),
+    delays=st.lists(st.lists(st.floats(0.0, 0.5), min_size=4, max_size=4), min_size=2, max_size=2),
+)
+def test_the_sets_follow_from_the_stamps_alone(
+    phases: list[float],
+    drifts: list[float],
+    lost: set[tuple[int, int]],
+    delays: list[list[float]],
+) -> None:
+    """A set was closed before the frame that fitted it better had come, or after, by chance."""
+    found: list[list[dict[str, int]]] = []
+    for delay in delays:
+        matcher: FramesetMatcher[int] = FramesetMatcher(_CAMERAS, 0.025)
+        times = {
+            (camera, index): phases[camera] + index / 30 * (1.0 + drifts[camera])
+            for camera in range(4)
+            for index in range(60)
+            if (camera, index) not in lost
+        }
+        arrivals = sorted((time_s + delay[key[0]], key, time_s) for key, time_s in times.items())
+        found.append(
+            [
+                one.frames
+                for _, (camera, index), time_s in arrivals
+                for one in matcher.push(_CAMERAS[camera], time_s, index)
+            ]
+        )
+    both = min(map(len, found))
+    assert found[0][:both] == found[1][:both]
