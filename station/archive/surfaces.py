@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from station.core.errors import FormatError
+from station.core.files import read_regular
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -18,6 +19,8 @@ _NEIGHBOURS = 4
 _TRIMMED = 0.7
 """The share of the body that is aligned: arms in a different position must not affect it."""
 _ROUNDS = 12
+_MAX_BYTES = 1 << 26
+"""A result's mesh has 0.3 MB."""
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
@@ -39,16 +42,18 @@ def read_mesh(path: Path) -> Surface:
         FormatError: it is missing, or not a binary PLY of triangles.
     """
     try:
-        data = path.read_bytes()
-    except OSError:
-        raise FormatError(f"{path.parent.name} has no {path.name}") from None
-    head, _, body = data.partition(b"end_header\n")
-    counts = dict(line.split()[1:3] for line in head.splitlines() if line.startswith(b"element"))
-    try:
-        vertices, faces = int(counts[b"vertex"]), int(counts[b"face"])
+        data = read_regular(path, _MAX_BYTES)
+        head, _, body = data.partition(b"end_header\n")
+        words = (line.split() for line in head.splitlines())
+        counts = {line[1]: int(line[2]) for line in words if line[:1] == [b"element"]}
+        vertices, faces = counts[b"vertex"], counts[b"face"]
         corners = np.frombuffer(body, _FACE, faces, vertices * _VERTEX.itemsize)
         points = np.frombuffer(body, _VERTEX, vertices)
-    except (KeyError, ValueError) as cause:
+        if faces and not 0 <= corners["corners"].min() <= corners["corners"].max() < vertices:
+            raise ValueError("a corner is no vertex")
+    except OSError:
+        raise FormatError(f"{path.parent.name} has no {path.name}") from None
+    except (KeyError, IndexError, ValueError, OverflowError) as cause:
         raise FormatError(f"{path} is not a mesh that this program wrote ({cause})") from None
     stacked = np.stack([points["x"], points["y"], points["z"]], axis=1)
     return Surface(stacked.astype(np.float64), corners["corners"].copy())

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from station.core.errors import InputError
 from workers.cloud.floor import UNITS_M, check_units, standing_on
 from workers.cloud.observed import LEAST_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
+from workers.cloud.ply import read_points, read_triangles
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -38,6 +39,8 @@ _SIGMA_M = 0.001
 """Standard deviation that is assumed for the points of a file."""
 _UNSEEN_SOLES_M = 0.03
 """A cloud that begins this little above its z = 0 stands on it: cameras do not see soles."""
+_MAX_EXTENT_M = 12.0
+"""Size of a room: a cell of the search for the person's surroundings takes memory."""
 _OFF_FLOOR_M = 0.05
 """Largest distance of a mesh's soles from the floor, which heights are measured from."""
 
@@ -63,6 +66,11 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     if up == "y":
         cloud.rotate(_Z_FROM_Y, np.zeros(3))
     check_units(np.asarray(cloud.points), unit, up)
+    extent_m = float(np.ptp(np.asarray(cloud.points), axis=0).max())
+    if not extent_m < _MAX_EXTENT_M:
+        raise InputError(
+            f"{path} has points {extent_m:.4g} m apart; cut the person out, or name its --unit"
+        )
     person = standing_on(np.asarray(cloud.points))
     if person is not None:
         cloud = cloud.select_by_index(np.flatnonzero(person[0]))
@@ -92,7 +100,7 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
     """Points of a file, thinned to what the fit can use."""
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a point cloud, .ply or .pcd")
-    cloud = o3d.io.read_point_cloud(path)
+    cloud = _read(path)
     points = np.asarray(cloud.points)
     if not len(points):
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
@@ -103,6 +111,24 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
     if len(points) > _MAX_POINTS:
         kept = np.random.default_rng(len(points)).permutation(len(points))[:_MAX_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
+    return cloud
+
+
+def _read(path: Path) -> o3d.geometry.PointCloud:
+    """The cloud of a file as it stands there; an empty one where there is none."""
+    if path.suffix.lower() != ".ply":
+        # Open3D's warnings would repeat the error that is raised.
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            return o3d.io.read_point_cloud(path)
+    try:
+        points, normals = read_points(path)
+    except (OSError, ValueError) as cause:
+        raise InputError(
+            f"{path} cannot be read ({cause}); give a point cloud, .ply or .pcd"
+        ) from None
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(normals)
     return cloud
 
 
@@ -202,10 +228,10 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
 def _ply(path: Path) -> tuple[Array, Faces]:
     if path.suffix.lower() != ".ply":
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    # Open3D's warnings would repeat the error that is raised.
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(path)
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    try:
+        return read_triangles(path)
+    except (OSError, ValueError):
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
 
 
 def _obj(path: Path) -> tuple[Array, Faces]:
@@ -217,5 +243,5 @@ def _obj(path: Path) -> tuple[Array, Faces]:
             [word.split("/")[0] for word in words[1:4]] for words in lines if words[:1] == ["f"]
         ]
         return np.array(vertices, float).reshape(-1, 3), np.array(corners, np.int32) - 1
-    except ValueError:
+    except (OSError, ValueError, OverflowError):
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
