@@ -59,7 +59,7 @@ class FrameCheck:
             self._name("its time stamps do not advance", header.received_s)
         elif self._same_pictures >= _REPEATS_NAMED:
             self._name("it keeps sending the same picture", header.received_s)
-        return not (again or stuck)
+        return not (again or stuck or self._slow())
 
     def rate_hz(self) -> float | None:
         """Frame rate by the device's own clock; None before enough frames have arrived."""
@@ -69,13 +69,17 @@ class FrameCheck:
         """The problem and its remedy in words; empty when there is none."""
         if now_s - self._trouble_s < _REMEMBERED_S:
             return f"{self._trouble}; unplug the sensor and plug it in again"
-        rate_hz = self.rate_hz()
-        if rate_hz is not None and rate_hz < MIN_RATE_HZ:
+        if self._slow():
+            rate_hz = self.rate_hz()
             return (
                 f"it sends {rate_hz:.0f} frames per second, {MIN_RATE_HZ:.0f} are needed; "
                 "connect it to a USB controller of its own"
             )
         return ""
+
+    def _slow(self) -> bool:
+        rate_hz = self.rate_hz()
+        return rate_hz is not None and rate_hz < MIN_RATE_HZ
 
     def _name(self, trouble: str, now_s: float) -> None:
         self._trouble, self._trouble_s = trouble, now_s

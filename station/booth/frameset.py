@@ -14,8 +14,8 @@ _LONGEST_QUEUE = 20
 """Two thirds of a second: frames of one camera may come half a second after those of the others."""
 
 _SURE_SHARE = 0.6
-"""Of the tolerance, which is three quarters of a period at most: a set that is tighter than half a
-period cannot be made tighter by what the earliest camera may still send, so it need not wait."""
+"""Share of the tolerance, which is three quarters of a period at most: a set that is tighter than
+half a period cannot be made tighter by the earliest camera's next frame, so it need not wait."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,9 +48,7 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     sync = processes["sync"]
     if not sync or sync["age_s"] > MAX_AGE_S:
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
-    for name, camera in sync.get("cameras", {}).items():
-        if camera["trouble"]:
-            problems.append(f"camera {name}: {camera['trouble']}")
+    problems += _cameras(sync, wanted=bool(processes["control"].get("streaming")))
     problems += [
         str(problem) for content in processes.values() for problem in content.get("problems", [])
     ]
@@ -71,6 +69,26 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         for name, content in processes.items()
         if not content or content["age_s"] > MAX_AGE_S
     ]
+
+
+def _cameras(sync: dict[str, Any], *, wanted: bool) -> list[str]:
+    """Cameras whose frames are not what they should be.
+
+    Args:
+        wanted: the operator has started the sensors.
+    """
+    told: dict[str, dict[str, Any]] = sync.get("cameras", {})
+    problems = [
+        f"camera {name}: {camera['trouble']}" for name, camera in told.items() if camera["trouble"]
+    ]
+    for name in sync.get("silent", []) if wanted else []:
+        state = told.get(name, {}).get("state", "off")
+        # A sensor that is being opened is not silent yet; the process says when it cannot be.
+        if state in ("streaming", "lost"):
+            detail = told[name]["detail"]
+            why = f" ({detail})" if detail else ""
+            problems.append(f"camera {name} sends no frames{why}; check its cable")
+    return problems
 
 
 def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], float, list[str], int]:

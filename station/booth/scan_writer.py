@@ -27,6 +27,12 @@ from station.core.spool import Spool
 
 T = TypeVar("T")
 _DISK_RETRY_S = 0.5
+_STALLED_S = 3.0
+"""A bundle is written in less than one, a verdict in milliseconds."""
+_DISK_LATE = (
+    "the spool's disk answered too late, and the scan was not started; check it with station "
+    "status and scan again"
+)
 _ENDED = "the station was interrupted during the scan; scan again"
 
 
@@ -57,6 +63,8 @@ class ScanWriter:
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._events: queue.SimpleQueue[Started | Ended] = queue.SimpleQueue()
         self._stop = threading.Event()
+        self._begun_s: float | None = None
+        """Start of the task that is being done."""
         self._thread = threading.Thread(target=self._run, name="scan writer", daemon=True)
         self._thread.start()
         self._tasks.put(self._settle_abandoned)
@@ -93,10 +101,20 @@ class ScanWriter:
 
     def _run(self) -> None:
         while (task := self._tasks.get()) is not None:
+            self._begun_s = time.monotonic()
             try:
                 task()
             except Exception:
                 self._log.exception("the outcome of a scan could not be recorded")
+            finally:
+                self._begun_s = None
+
+    def stalled(self, now_s: float) -> str:
+        """The disk's delay in words, once it is long; empty otherwise."""
+        begun_s = self._begun_s
+        if begun_s is None or now_s - begun_s < _STALLED_S:
+            return ""
+        return f"the spool's disk has not answered for {now_s - begun_s:.0f} s"
 
     def _guarded(self, order: Order, task: Callable[[], None]) -> None:
         """Run a task; an error becomes the scan's outcome, unless it was accepted anyway."""
@@ -128,7 +146,7 @@ class ScanWriter:
         note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
         spool.notes.write(note, durable=False)
         if order.late(time.monotonic()):
-            raise BoothError(LATE)
+            raise BoothError(_DISK_LATE)
         self._events.put(Started(order, rig))
 
     def _refuse(self, order: Order, reason: str) -> None:

@@ -23,6 +23,7 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
+from station.core.rig import Rig
 from station.core.scans import ScanId, scan_id_of
 from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.intake import FrameIntake, LiveFrame
@@ -102,7 +103,10 @@ class SyncProcess:
         if collection is not None:
             complete = collection.add(found, now_s)
             self._tell(collection, "writing" if complete else "capturing")
-            if complete:
+            if complete and (wrong := self._wrong_sensors(collection.rig)):
+                self._collection = None
+                self._fail(collection.order, "; ".join(wrong))
+            elif complete:
                 self._collection = None
                 self._writing[collection.order.scan_id] = collection.order
                 self._writer.write(collection)
@@ -131,10 +135,7 @@ class SyncProcess:
         deadline_s = time.monotonic() + scan.max_duration_s
         self._collection = Collection(event.order, event.rig, scan.framesets, deadline_s)
         self._live.rig = event.rig
-        wrong = wrong_sensors(
-            self._serials, {name: event.rig.cameras[name].serial for name in self._names}
-        )
-        if wrong:
+        if wrong := self._wrong_sensors(event.rig):
             self._collection = None
             self._fail(event.order, "; ".join(wrong))
         else:
@@ -164,6 +165,10 @@ class SyncProcess:
             for name in self._names
             if (trouble := self._checks[name].trouble(now_s))
         ]
+
+    def _wrong_sensors(self, rig: Rig) -> list[str]:
+        known = {name: rig.cameras[name].serial for name in self._names if name in rig.cameras}
+        return wrong_sensors(self._serials, known)
 
     def _answer(self) -> None:
         *route, packed = self._commands.recv_multipart()
@@ -204,6 +209,8 @@ class SyncProcess:
 
     def _unready(self) -> str:
         """Reason why no scan can be taken now; empty if one can."""
+        if self._order is not None and (stalled := self._writer.stalled(time.monotonic())):
+            return f"{stalled}; check it with station status, and scan again when it does"
         if self._order is not None or self._collection is not None:
             current = self._order or (self._collection and self._collection.order)
             return f"scan {current and current.scan_id} is being taken; wait until it is done"
@@ -255,6 +262,10 @@ class SyncProcess:
                 if (health := self._intake.health.get(name))
             },
             "silent": silent,
+            "problems": [
+                *filter(None, [self._writer.stalled(now_s)]),
+                *(self._wrong_sensors(rig) if (rig := self._live.rig) else []),
+            ],
             "framesets": self._set_count,
             "latency_p50_s": latencies[len(latencies) // 2] if latencies else None,
             "latency_p99_s": latencies[int(0.99 * len(latencies))] if latencies else None,

@@ -25,7 +25,7 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(slots=True)
 class _Element:
-    """What a file's head says of one kind of row."""
+    """One kind of row, as the file's head describes it."""
 
     name: str
     count: int

@@ -1,0 +1,64 @@
+"""Problems that `station status` lists, from the processes' health files."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.booth.health import booth_health
+from station.core.config import BoothConfig, load_config
+from station.core.service import HEALTH, file_name
+
+_CAMERAS = ("a", "b")
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> BoothConfig:
+    cameras = "".join(
+        f'[[cameras]]\nname = "{name}"\ndriver = "recorded"\nrecording = "{name}"\n'
+        for name in _CAMERAS
+    )
+    (tmp_path / "booth.toml").write_text(f"{cameras}[console]\nenabled = false\n")
+    return load_config(tmp_path / "booth.toml")
+
+
+def _tell(config: BoothConfig, process: str, **content: Any) -> None:
+    folder = config.runtime.folder / HEALTH
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {"told_s": time.monotonic(), **content}
+    (folder / f"{file_name(process)}.json").write_text(json.dumps(document))
+
+
+def _problems(config: BoothConfig, *, streaming: bool, **sync: Any) -> list[str]:
+    for process in ("capture a", "capture b", "workers"):
+        _tell(config, process)
+    _tell(config, "control", streaming=streaming)
+    _tell(config, "sync", **sync)
+    return booth_health(config).problems
+
+
+def _camera(state: str, detail: str = "", trouble: str = "") -> dict[str, str]:
+    return {"state": state, "detail": detail, "trouble": trouble}
+
+
+def test_a_silent_camera_is_named_once_the_sensors_are_started(config: BoothConfig) -> None:
+    cameras = {"a": _camera("lost", "no such device"), "b": _camera("streaming")}
+    [problem] = _problems(config, streaming=True, silent=["a"], cameras=cameras)
+    assert problem.startswith("camera a sends no frames (no such device)")
+    assert _problems(config, streaming=False, silent=["a"], cameras=cameras) == []
+
+
+def test_a_camera_that_is_being_opened_is_no_problem(config: BoothConfig) -> None:
+    cameras = {"a": _camera("opening"), "b": _camera("streaming")}
+    assert _problems(config, streaming=True, silent=["a"], cameras=cameras) == []
+
+
+def test_what_sync_says_of_its_disk_and_sensors_is_named(config: BoothConfig) -> None:
+    cameras = {"a": _camera("streaming", trouble="it keeps sending the same picture")}
+    words = "the spool's disk has not answered for 4 s"
+    found = _problems(config, streaming=True, silent=[], cameras=cameras, problems=[words])
+    assert found == ["camera a: it keeps sending the same picture", words]
