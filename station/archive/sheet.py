@@ -20,15 +20,18 @@ from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.pdfgen.canvas import Canvas
 
 from station.archive.figure import Line, View, draw_views, heading_rad
+from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.archive.surfaces import read_mesh
-from station.archive.tables import DIGITS, Pose, Unit, read_measurements, rows
+from station.archive.tables import DIGITS, Pose, Unit, read_measurements, rows, side_differences
 from station.archive.terms import Language
 
 _WIDTH, _HEIGHT = A4
 _MARGIN = 34.0
 _FIGURE_TOP, _FIGURE_HEIGHT = _HEIGHT - 104.0, 316.0
 _ROW_HEIGHT = 13.6
+_DIFFERENCE = 60.0
+"""From a column's right edge to where the differences of left and right end."""
 _INK, _GREY, _RULE = HexColor("#16202c"), HexColor("#5c6a7a"), HexColor("#cdd5de")
 _LINE = HexColor("#c2410c")
 _VERDICTS = {
@@ -38,11 +41,15 @@ _VERDICTS = {
 _WORDS: dict[Language, dict[str, str]] = {
     "en": {"front": "front", "left": "left side", "back": "back", "as-scanned": "as scanned",
            "standard": "standard pose", "value": "value", "l": "left", "r": "right",
-           "note": "± half the 95 % interval. Lines are drawn where they were measured.",
+           "difference": "left - right",
+           "note": "± half the 95 % interval. Lines are drawn where they were measured. "
+           "Differences of the sides in bold are larger than their interval.",
            "unlabelled": "no label"},
     "zh": {"front": "正面", "left": "左侧", "back": "背面", "as-scanned": "扫描姿势",
            "standard": "标准姿势", "value": "数值", "l": "左", "r": "右",
-           "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。", "unlabelled": "无订单"},
+           "difference": "左 - 右",
+           "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。粗体的左右差值超出其区间。",
+           "unlabelled": "无订单"},
 }  # fmt: skip
 _LATIN, _BOLD, _CHINESE, _OTHER = "Helvetica", "Helvetica-Bold", "STSong-Light", "Other"
 _OTHER_FILES = (
@@ -62,6 +69,8 @@ class _Entry:
     names: tuple[str, ...]
     values: tuple[tuple[str, float | None, float], ...]
     """(side, value, half of the interval); no value where the part is missing in the scan."""
+    difference: tuple[float, bool] | None
+    """Left less right, and whether it is more than its interval."""
 
 
 def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: Language) -> bytes:
@@ -71,7 +80,8 @@ def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: 
         FormatError: the result is damaged.
     """
     drawn = read_measurements(folder, "as-scanned")["measurements"]
-    entries = _entries(rows(read_measurements(folder, pose), unit, language))
+    table = read_measurements(folder, pose)
+    entries = _entries(rows(table, unit, language), side_differences(table, unit, language))
     views = draw_views(read_mesh(folder / "mesh.ply"), drawn, heading_rad(folder))
     stream = io.BytesIO()
     canvas = Canvas(stream, pagesize=A4, invariant=True)
@@ -85,8 +95,11 @@ def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: 
     return stream.getvalue()
 
 
-def _entries(table: Sequence[dict[str, Any]]) -> list[_Entry]:
+def _entries(
+    table: Sequence[dict[str, Any]], differences: Sequence[dict[str, Any]]
+) -> list[_Entry]:
     """Rows with left and right side by side, numbered."""
+    known = {f"{found['name']}_left": (found["value"], found["real"]) for found in differences}
     grouped: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         grouped.setdefault(row["words"], []).append(row)
@@ -96,6 +109,7 @@ def _entries(table: Sequence[dict[str, Any]]) -> list[_Entry]:
             words,
             tuple(row["name"] for row in group),
             tuple((row["side"], row["value"], _half(row)) for row in group),
+            next((known[row["name"]] for row in group if row["name"] in known), None),
         )
         for number, (words, group) in enumerate(grouped.items(), start=1)
     ]
@@ -123,7 +137,7 @@ def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: La
     moment = scan.created.replace("T", "  ").removesuffix("Z") + " UTC"
     facts = [moment, scan.scan_id, scan.booth, words[pose], unit]
     _text(canvas, _MARGIN, _HEIGHT - 68, "   ·   ".join(filter(None, facts)), 8.5, _GREY)
-    reasons = "; ".join(scan.reasons)
+    reasons = in_language("; ".join(scan.reasons), language)
     if reasons:
         _text(canvas, _MARGIN, _HEIGHT - 82, reasons[:150], 8, colour)
     canvas.setStrokeColor(_RULE)
@@ -232,6 +246,7 @@ def _table(canvas: Canvas, entries: Sequence[_Entry], unit: Unit, language: Lang
         left = _MARGIN + column * (width + 18)
         for offset, title in (
             (width - 92, f"{words['value']} / {words['l']}"),
+            (width - _DIFFERENCE, words["difference"]),
             (width - 2, words["r"]),
         ):
             _text(canvas, left + offset - _width(title, 6.5), top + 2, title, 6.5, _GREY)
@@ -242,6 +257,11 @@ def _table(canvas: Canvas, entries: Sequence[_Entry], unit: Unit, language: Lang
             canvas.line(left, y - 3, left + width, y - 3)
             _text(canvas, left, y, str(entry.number), 6.5, _GREY)
             _text(canvas, left + 15, y, entry.words, 7.6, _INK)
+            if entry.difference is not None:
+                less, real = entry.difference
+                text = f"{less:+.{digits}f}"
+                right = left + width - _DIFFERENCE
+                _text(canvas, right - _width(text, 6.8, real), y, text, 6.8, _INK, real)
             for side, value, around in entry.values:
                 right = left + width - (2 if side == "right" else 92)
                 if value is None:

@@ -79,6 +79,33 @@ def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any
     }
 
 
+def side_differences(
+    document: dict[str, Any], unit: Unit, language: Language
+) -> list[dict[str, Any]]:
+    """Left less right of each measurement with two sides, with its 95 % interval in a unit.
+
+    `real` says that the interval does not hold 0. Results of earlier versions have none.
+    """
+    found = []
+    for entry in document.get("differences", ()):
+        low, high = entry["interval95_m"]
+        value, *ends = (
+            round(PER_METRE[unit] * length, DIGITS[unit])
+            for length in (entry["value_m"], low, high)
+        )
+        found.append(
+            {
+                "name": str(entry["name"]),
+                "words": plain_name(f"{entry['name']}_left", language, with_side=False),
+                "value": value,
+                "low": ends[0],
+                "high": ends[1],
+                "real": low > 0.0 or high < 0.0,
+            }
+        )
+    return found
+
+
 def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: Language) -> str:
     """A line for each measurement, each with the order, the date, the verdict and the pose.
 

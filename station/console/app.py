@@ -16,6 +16,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
 from station import __version__
+from station.archive.phrases import PHRASES
 from station.console.api import booth, live, results, scans
 from station.console.api.console import Console
 from station.console.api.problems import Problem, install
@@ -84,15 +85,20 @@ def _serve_pages(app: FastAPI) -> None:
         ("/person", "person.html"),
         (f"{PREFIX}/docs", "docs.html"),
     ):
-        app.add_api_route(path, _page(name), include_in_schema=False, response_class=FileResponse)
+        file = _file(STATIC / name)
+        app.add_api_route(path, file, include_in_schema=False, response_class=FileResponse)
+    # The page's words for what the station says are those of the printed sheet.
+    app.add_api_route(
+        "/static/phrases.json", _file(PHRASES), include_in_schema=False, response_class=FileResponse
+    )
     app.mount("/static", _Static(directory=STATIC), name="static")
 
 
-def _page(name: str) -> Any:
-    def page() -> FileResponse:
-        return FileResponse(STATIC / name, headers={"cache-control": "no-cache"})
+def _file(path: Path) -> Any:
+    def file() -> FileResponse:
+        return FileResponse(path, headers={"cache-control": "no-cache"})
 
-    return page
+    return file
 
 
 def _document(app: FastAPI) -> dict[str, Any]:

@@ -73,7 +73,7 @@ class BoothState(BaseModel):
     spool: dict[str, int]
     disk_free_mb: float
     disk_needed_mb: float
-    calibration: str = Field(description="date of the calibration in use; empty if there is none")
+    calibration: str = Field(description="the calibration in use, by name or date; empty: none")
     last_check: Check | None
     waiting_deliveries: list[Delivery]
 
@@ -145,6 +145,17 @@ class Row(BaseModel):
     standard: str
 
 
+class SideDifference(BaseModel):
+    """Left less right of one measurement."""
+
+    name: str = Field(description="of both rows, without the side")
+    words: str
+    value: float
+    low: float = Field(description="lower end of the 95 % interval")
+    high: float
+    real: bool = Field(description="the interval does not hold 0")
+
+
 class Measurements(BaseModel):
     """A result's table."""
 
@@ -155,6 +166,7 @@ class Measurements(BaseModel):
     pose: Literal["as-scanned", "standard"]
     unit: Literal["cm", "in", "m"]
     rows: list[Row]
+    differences: list[SideDifference]
 
 
 class Part(BaseModel):

@@ -18,7 +18,7 @@ from station.archive.compare import compare_rows, compare_surfaces
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
-from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows
+from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows, side_differences
 from station.archive.terms import Language
 from station.console.api.console import SCAN_ID, Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
@@ -86,7 +86,8 @@ def file(
         raise ProblemError(404, "no-such-file", f"scan {scan_id} has no file {name}")
     digest = _result(folder).get("files", {}).get(name) or f"{path.stat().st_mtime_ns:x}"
     tag = f'"{digest}"'
-    if if_none_match and tag in (part.strip() for part in if_none_match.split(",")):
+    known = {part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")}
+    if known & {tag, "*"}:
         return Response(status_code=304, headers={"etag": tag})
     media = MEDIA_TYPES.get(path.suffix, "application/octet-stream")
     return FileResponse(path, media_type=media, headers={"etag": tag, "cache-control": "no-cache"})
@@ -156,6 +157,9 @@ def measurements(table: Selected) -> Measurements:
         pose=table.pose,
         unit=table.unit,
         rows=rows(table.document, table.unit, table.language),  # type: ignore[arg-type]
+        differences=side_differences(  # type: ignore[arg-type]
+            table.document, table.unit, table.language
+        ),
     )
 
 

@@ -1,10 +1,12 @@
 // Requests to the API; a problem document becomes an Error with its words.
 
+import { said } from './i18n.js';
+
 const PREFIX = '/api/v1';
 
 export class Problem extends Error {
   constructor(status, document) {
-    super(document.detail || document.title || `HTTP ${status}`);
+    super(said(document.detail || '') || document.title || `HTTP ${status}`);
     this.status = status;
     this.kind = (document.type || '').replace('/problems/', '');
   }

@@ -58,8 +58,12 @@ async function show() {
   document.title = `${t(`${view === 'calibration' ? 'cal' : view}.title`)} – ${t('app.title')}`;
   try {
     const draw = await VIEWS[view]();
-    const left = await draw(main, session, ...rest.map(decodeURIComponent));
-    if (mine === turn) leave = left; else left();
+    // Drawn aside: a slow view that was left meanwhile must not cover the one that came after it.
+    const place = h('div');
+    const left = await draw(place, session, ...rest.map(decodeURIComponent));
+    if (mine !== turn) { left(); return; }
+    main.replaceChildren(place);
+    leave = left;
   } catch (error) {
     if (mine !== turn || error.kind === 'not-logged-in') return;
     main.replaceChildren(h('div', { className: 'empty' }, h('h1', {}, t('error')), h('p', { role: 'alert' }, error.message)));

@@ -4,7 +4,7 @@ import { get, post, freshKey } from './api.js';
 import { Cameras } from './cameras.js';
 import { h, notice } from './dom.js';
 import { listen } from './events.js';
-import { t, time } from './i18n.js';
+import { said, t, time } from './i18n.js';
 
 const REFRESH_MS = 5000;
 
@@ -51,7 +51,7 @@ export async function booth(main) {
       [t('booth.calibration'), state.calibration || t('booth.none')],
     ];
     facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name), h('dd', {}, value)]));
-    const fault = !state.running ? t('booth.notRunning', { fault: state.fault })
+    const fault = !state.running ? t('booth.notRunning', { fault: said(state.fault) })
       : state.disk_free_mb < 1.5 * state.disk_needed_mb ? t('booth.diskLow') : '';
     banner.hidden = !fault;
     banner.className = `banner ${state.running ? 'warn' : 'bad'}`;
@@ -61,7 +61,7 @@ export async function booth(main) {
       : `${time(last.time)} – ${last.moved.length ? t('booth.checkMoved', { names: last.moved.join(', ') }) : t('booth.checkGood')}`;
     deliveries.hidden = state.waiting_deliveries.length === 0;
     deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
-      ...state.waiting_deliveries.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${one.error}` : ''}`)));
+      ...state.waiting_deliveries.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${said(one.error)}` : ''}`)));
   }
 
   async function refresh() {
@@ -97,7 +97,7 @@ export async function booth(main) {
       show();
     } else if (kind === 'calibration' && data.kind === 'check' && !data.running) {
       checkButton.disabled = false;
-      if (data.error) notice(data.error, true);
+      if (data.error) notice(said(data.error), true);
       refresh();
     } else if (kind !== 'scan') refresh();
   });

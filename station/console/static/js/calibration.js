@@ -4,7 +4,7 @@ import { freshKey, get, post, remove } from './api.js';
 import { Cameras } from './cameras.js';
 import { ask, h, notice } from './dom.js';
 import { listen } from './events.js';
-import { t, time } from './i18n.js';
+import { said, t, time } from './i18n.js';
 
 const STEPS = ['floor', 'ball', 'mark', 'around', 'depth', 'solve'];
 
@@ -26,30 +26,30 @@ export async function calibration(main, session) {
     const tell = task.kind === 'calibrate' && (task.error || task.lines.length);
     now.className = 'card';
     now.replaceChildren(h('h2', {}, t('cal.all')),
-      task.error ? h('div', { className: 'banner bad', id: 'task-error' }, task.error) : '',
+      task.error ? h('div', { className: 'banner bad', id: 'task-error' }, said(task.error)) : '',
       session.recordings ? h('p', { className: 'soft' }, t('cal.recordings')) : '',
       h('div', { className: 'actions left' },
         h('button', { className: 'primary', id: 'calibrate', onclick: () => begin('all') }, t('cal.continue')),
         h('button', { id: 'anew', onclick: () => begin('all', true) }, t('cal.new'))),
-      tell ? h('div', { className: 'log', id: 'log' }, task.lines.map((line) => h('div', {}, line))) : '');
+      tell ? h('div', { className: 'log', id: 'log' }, task.lines.map((line) => h('div', {}, said(line)))) : '');
   }
 
   function running(task) {
     const percent = /(\d+) % covered/.exec(task.progress);
     const of = /(\d+) of (\d+)/.exec(task.progress);
     const share = percent ? Number(percent[1]) / 100 : of ? Number(of[1]) / Number(of[2]) : null;
-    const bar = h('progress', { max: 1, 'aria-label': task.progress || t('loading') });
+    const bar = h('progress', { max: 1, 'aria-label': said(task.progress) || t('loading') });
     if (share !== null) bar.value = share;
     now.className = 'card now';
-    now.replaceChildren(h('h2', {}, task.title || t('loading')), h('p', { className: 'instruction' }, task.waits_for === 'yes or no' ? task.question : task.instruction),
+    now.replaceChildren(h('h2', {}, task.title ? said(task.title) : t('loading')), h('p', { className: 'instruction' }, said(task.waits_for === 'yes or no' ? task.question : task.instruction)),
       task.countdown_s ? h('div', { className: 'count' }, String(task.countdown_s)) : '',
       h('div', { className: 'actions left' },
         task.waits_for === 'go' ? h('button', { className: 'primary', onclick: () => say('go') }, t('cal.go')) : '',
         task.waits_for === 'yes or no' ? h('button', { className: 'primary', onclick: () => say('yes') }, t('cal.yes')) : '',
         task.waits_for === 'yes or no' ? h('button', { onclick: () => say('no') }, t('cal.no')) : '',
         h('button', { className: 'danger', id: 'halt', onclick: halt }, t('cal.stop'))),
-      task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, task.progress || ' '), bar),
-      h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, line))));
+      task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, said(task.progress) || ' '), bar),
+      h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, said(line)))));
   }
 
   function show(task) {

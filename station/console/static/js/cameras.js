@@ -1,7 +1,7 @@
 // Cards of cameras: picture, state, remedy.
 
 import { h } from './dom.js';
-import { t } from './i18n.js';
+import { said, t } from './i18n.js';
 import { Pictures } from './pictures.js';
 
 const LOOKS = { streaming: 'good', opening: 'warn', lost: 'bad', dead: 'bad', off: '' };
@@ -34,7 +34,7 @@ export class Cameras {
     card.card.dataset.state = camera.state;
     const amiss = camera.state === 'lost' || camera.state === 'dead';
     card.remedy.hidden = !(amiss && camera.detail);
-    card.remedy.textContent = camera.detail;
+    card.remedy.textContent = said(camera.detail);
   }
 
   draw(name, bitmap, somebody) {

@@ -11,8 +11,8 @@ const TYPING_MS = 250;
 
 export async function history(main, session) {
   const search = h('input', { type: 'search', id: 'search', placeholder: t('history.search'), 'aria-label': t('history.search') });
-  const since = h('input', { type: 'date', 'aria-label': t('history.since'), title: t('history.since') });
-  const until = h('input', { type: 'date', 'aria-label': t('history.until'), title: t('history.until') });
+  const since = h('input', { type: 'date' });
+  const until = h('input', { type: 'date' });
   const body = h('tbody');
   const card = h('section', { className: 'card table-card history' });
   const more = h('button', { hidden: true, onclick: () => load(false) }, t('history.more'));
@@ -85,7 +85,8 @@ export async function history(main, session) {
   until.addEventListener('change', soon);
   main.replaceChildren(
     h('div', { className: 'head' }, h('h1', {}, t('history.title')), h('span', { className: 'grow' }), compare),
-    h('div', { className: 'filters', role: 'search' }, search, since, until), card, h('p', {}, more));
+    h('div', { className: 'filters', role: 'search' }, search,
+      h('label', {}, t('history.since'), since), h('label', {}, t('history.until'), until)), card, h('p', {}, more));
   count();
   await load();
   const silence = listen((kind, data) => {

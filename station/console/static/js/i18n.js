@@ -1,6 +1,7 @@
 // Words from one catalogue, numbers and times in the reader's way.
 
 let words = {};
+let phrases = [];
 let language = 'en';
 
 export async function loadWords(fallback) {
@@ -9,6 +10,31 @@ export async function loadWords(fallback) {
   language = catalogue[kept] ? kept : (fallback || 'en');
   words = catalogue[language];
   document.documentElement.lang = language === 'zh' ? 'zh-CN' : 'en';
+  if (language === 'zh') phrases = compiled(await (await fetch('/static/phrases.json')).json());
+}
+
+// What the station says (a reason, a remedy, an error) in the reader's language. The same rules as
+// in station/archive/phrases.py, which prints them on the sheet.
+const BETWEEN = /; (?![^(]*\))/;
+
+function compiled(table) {
+  const fixed = (english) => english.replace(/\{\w+\}/g, '').length;
+  return Object.entries(table).sort((one, other) => fixed(other[0]) - fixed(one[0])).map(([english, chinese]) => {
+    const parts = english.split(/\{(\w+)\}/);
+    const source = parts.map((part, i) => (i % 2 ? `(?<${part}>.*?)` : part.replace(/[.*+?^${}()|[\]\\]/g, '\\$&'))).join('');
+    return [new RegExp(`^${source}$`, 's'), chinese];
+  });
+}
+
+export function said(text) {
+  if (!phrases.length) return text;
+  return text.split(BETWEEN).map((piece) => {
+    for (const [pattern, chinese] of phrases) {
+      const found = pattern.exec(piece);
+      if (found) return chinese.replace(/\{(\w+)\}/g, (_, name) => said(found.groups[name]));
+    }
+    return piece;
+  }).join('；');
 }
 
 export function t(key, values = {}) {

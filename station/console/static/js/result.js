@@ -2,7 +2,7 @@
 
 import { address, bytes, get } from './api.js';
 import { h, notice, segmented } from './dom.js';
-import { currentLanguage, t, time } from './i18n.js';
+import { currentLanguage, said, t, time } from './i18n.js';
 import { readPly } from './ply.js';
 import { choose, digits, settings } from './settings.js';
 
@@ -18,7 +18,7 @@ export async function result(main, session, scanId) {
   const scan = await get(path);
   if (!['delivered', 'rescan'].includes(scan.state)) {
     main.replaceChildren(h('div', { className: 'empty' }, h('h1', {}, scan.label || scanId), h('p', {}, t('result.gone')),
-      verdictChip(scan), h('p', {}, scan.reasons.join('; '))));
+      verdictChip(scan), h('p', {}, said(scan.reasons.join('; ')))));
     return () => {};
   }
   let chosen = null;
@@ -27,11 +27,12 @@ export async function result(main, session, scanId) {
   const place = h('section', { className: 'card viewer', 'aria-label': t('result.model') },
     h('div', { className: 'name', id: 'line-name' }, t('result.tap')), h('div', { className: 'wait' }, t('result.loading')));
   const body = h('tbody', { className: 'rows', id: 'rows' });
+  const sides = h('tbody', { className: 'sides', id: 'differences' });
   const query = () => `pose=${settings.pose}&unit=${settings.unit}&language=${currentLanguage()}`;
   const note = h('p', { className: 'small soft', hidden: true }, t('result.standardNote'));
 
   async function table() {
-    const { rows } = await get(`${path}/measurements?${query()}`);
+    const { rows, differences } = await get(`${path}/measurements?${query()}`);
     note.hidden = settings.pose !== 'standard';
     body.replaceChildren(...rows.map((row) => {
       const side = row.side ? ` (${t(`result.${row.side}`)})` : '';
@@ -43,6 +44,11 @@ export async function result(main, session, scanId) {
         h('td', { className: 'number interval' }, row.value === null ? t('result.missing') : `${row.low.toFixed(digits())} – ${row.high.toFixed(digits())}`,
           ['partly', 'inferred'].includes(row.basis) ? h('div', {}, t(`result.${row.basis}`)) : null));
     }));
+    const signed = (value) => (value > 0 ? '+' : '') + value.toFixed(digits());
+    sides.replaceChildren(...(differences.length ? [h('tr', {}, h('th', { colSpan: 3, scope: 'rowgroup' }, t('result.sides')))] : []),
+      ...differences.map((row) => h('tr', { 'data-difference': row.name, className: row.real ? 'real' : '' }, h('td', {}, row.words),
+        h('td', { className: 'number' }, row.real ? h('b', {}, signed(row.value)) : signed(row.value)),
+        h('td', { className: 'number interval' }, `${signed(row.low)} – ${signed(row.high)}`))));
     pick(chosen, false);
     links();
   }
@@ -106,7 +112,7 @@ export async function result(main, session, scanId) {
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, scan.label || t('result.noLabel')),
       h('span', { className: 'small soft' }, `${time(scan.created)} · ${scan.scan_id}`)), verdictChip(scan), h('span', { className: 'grow' }),
       print, h('div', { className: 'menu' }, opener, menu)),
-    scan.reasons.length ? h('div', { className: 'banner warn' }, `${t('result.remarks')}: ${scan.reasons.join('; ')}`) : '',
+    scan.reasons.length ? h('div', { className: 'banner warn' }, `${t('result.remarks')}: ${said(scan.reasons.join('; '))}`) : '',
     h('div', { className: 'result' }, place,
       h('section', { className: 'card table-card' },
         h('div', { className: 'bar' },
@@ -114,7 +120,7 @@ export async function result(main, session, scanId) {
           segmented(t('result.unit'), [['cm', t('unit.cm')], ['in', t('unit.in')]], settings.unit, change('unit')), note),
         h('div', { className: 'table-scroll', tabIndex: 0, role: 'region', 'aria-label': t('result.title') },
           h('table', {}, h('thead', {}, h('tr', {}, h('th', {}, t('result.name')), h('th', { className: 'number' }, t('result.value')),
-            h('th', { className: 'number' }, t('result.interval')))), body)))));
+            h('th', { className: 'number' }, t('result.interval')))), body, sides)))));
   const shut = (event) => { if (!event.target.closest('.menu')) { menu.hidden = true; opener.setAttribute('aria-expanded', 'false'); } };
   document.addEventListener('click', shut);
   await table();

@@ -5,7 +5,7 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { t, time } from './i18n.js';
+import { said, t, time } from './i18n.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
@@ -149,7 +149,7 @@ export async function scan(main, session) {
       h('div', { className: `verdict ${look}`, id: 'verdict', 'data-verdict': look },
         bodyFigure(doubtful),
         h('div', {}, h('h2', {}, t(`scan.${look}`)), h('p', {}, done.label || t('result.noLabel')),
-          done.reasons.length ? h('ul', {}, done.reasons.map((reason) => h('li', {}, reason))) : null,
+          done.reasons.length ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
           done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: seconds })))),
       h('div', { className: 'actions' },
         done.state === 'failed' ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),

