@@ -7,7 +7,8 @@ import ipaddress
 import logging
 import socket
 import threading
-from typing import Any
+from collections import Counter
+from typing import Any, ClassVar
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -22,15 +23,28 @@ _HEAD_S = 10.0
 """A request's head has to arrive within this; a slow sender cannot hold a connection open."""
 _HEAD_BYTES = 16 << 10
 _MAX_CONNECTIONS = 200
+_MOST_OF_ONE_ADDRESS = 64
+"""A tablet opens less than ten; whoever opens more keeps nobody else out."""
 _STOP_S = 2
+_SEND_BYTES = 128 << 10
+"""Two of the four cameras' pictures. The kernel's own choice, 4 MB, is ten seconds of them, drawn
+for a viewer that reads nothing."""
 
 
 class PatientProtocol(H11Protocol):
-    """uvicorn's HTTP/1.1, but a request's head has to arrive in time."""
+    """uvicorn's HTTP/1.1, but a request's head has to arrive in time, and none opens too many."""
+
+    _open: ClassVar[Counter[str]] = Counter()
+    """Address -> its connections."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self._head_timer: asyncio.TimerHandle | None = None
+        self._address = self.client[0] if self.client else ""
+        self._open[self._address] += 1
+        if self._open[self._address] > _MOST_OF_ONE_ADDRESS:
+            transport.abort()
+            return
         self._expect_head()
 
     def data_received(self, data: bytes) -> None:
@@ -44,6 +58,9 @@ class PatientProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._cancel_head()
+        self._open[self._address] -= 1
+        if not self._open[self._address]:
+            del self._open[self._address]
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
@@ -139,6 +156,7 @@ def _listener(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)
     try:
         listener.bind((host, port))
     except OSError as cause:

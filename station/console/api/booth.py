@@ -37,6 +37,7 @@ from station.console.api.problems import ProblemError, responses
 from station.console.live.control import command
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, so3_log
+from station.core.rig import Rig
 from station.handover.ledger import Ledger
 from station.messaging.messages import Request as ControlRequest
 
@@ -57,17 +58,7 @@ def session(request: Request, console: Booth) -> Session:
 def log_in(body: Login, request: Request, response: Response, console: Booth) -> Session:
     """Log in; the session is a cookie."""
     address = request.client.host if request.client else "?"
-    wait_s = console.throttle.wait_s(address, time.monotonic())
-    if wait_s > 0:
-        raise ProblemError(
-            429, "too-many-tries", f"too many wrong passwords; wait {wait_s:.0f} s",
-            {"Retry-After": str(int(wait_s) + 1)},
-        )  # fmt: skip
-    if not console.vault.check_password(body.password):
-        console.throttle.failed(address, time.monotonic())
-        console.audit.note("?", address, "wrong password")
-        raise ProblemError(401, "wrong-password", "the password is wrong")
-    console.throttle.succeeded(address)
+    _check_password(console, address, body.password)
     console.audit.note("operator", address, "log in")
     hours = console.config.console.session_hours
     response.set_cookie(
@@ -80,6 +71,29 @@ def log_in(body: Login, request: Request, response: Response, console: Booth) ->
         path="/",
     )
     return _session(console, Caller("operator", address, ("read", "scan", "manage")))
+
+
+def _check_password(console: Console, address: str, password: str) -> None:
+    """End the request unless this is the operator's password, given not too often."""
+    # Not waited for: guesses sent all at once must not hold the threads that serve everybody.
+    if not console.checking.acquire(blocking=False):
+        raise _too_many("others are logging in just now", 1.0)
+    try:
+        wait_s = console.throttle.wait_s(address, time.monotonic())
+        if wait_s > 0:
+            raise _too_many("too many wrong passwords", wait_s)
+        if not console.vault.check_password(password):
+            console.throttle.failed(address, time.monotonic())
+            console.audit.note("?", address, "wrong password")
+            raise ProblemError(401, "wrong-password", "the password is wrong")
+        console.throttle.succeeded(address)
+    finally:
+        console.checking.release()
+
+
+def _too_many(what: str, wait_s: float) -> ProblemError:
+    retry = {"Retry-After": str(int(wait_s) + 1)}
+    return ProblemError(429, "too-many-tries", f"{what}; wait {max(wait_s, 1.0):.0f} s", retry)
 
 
 @router.delete("/session", responses=responses(), tags=["session"])
@@ -113,7 +127,7 @@ def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
     ledger = Ledger(console.config.spool.folder)
     return BoothState(
         **console.watch.booth(),
-        calibration=_store(console).name_in_use(),
+        calibration=_calibration_in_use(console),
         last_check=Check(time=check["time"], moved=check["moved"]) if check else None,
         waiting_deliveries=[Delivery(**entry.document()) for entry in ledger.waiting()],
     )
@@ -215,6 +229,18 @@ def compare(first: str, second: str, console: Booth, caller: Reader) -> list[Cam
             )
         )
     return sorted(shifts, key=lambda shift: shift.camera)
+
+
+def _calibration_in_use(console: Console) -> str:
+    """Name of the stored calibration in use; of one made elsewhere its date; "" without any."""
+    store = _store(console)
+    name = store.name_in_use()
+    if name or not store.in_use.exists():
+        return name
+    try:
+        return Rig.load(store.in_use).created
+    except CalibrationError:
+        return ""
 
 
 def _store(console: Console) -> CalibrationStore:

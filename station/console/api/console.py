@@ -23,7 +23,7 @@ from station.console.live.events import EventLog
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
 from station.console.security.audit import AuditLog
-from station.console.security.throttle import LoginThrottle
+from station.console.security.throttle import AT_ONCE, LoginThrottle
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.config import BoothConfig
 from station.core.service import Heartbeat
@@ -49,6 +49,8 @@ class Console:
     countdown: ScanCountdown = field(init=False)
     tasks: Tasks = field(init=False)
     throttle: LoginThrottle = field(init=False)
+    checking: threading.BoundedSemaphore = field(init=False)
+    """Held by each password that is being checked."""
     heart: Heartbeat = field(init=False)
     closing: threading.Event = field(init=False, default_factory=threading.Event)
 
@@ -61,7 +63,7 @@ class Console:
         self.pictures = Pictures(self.config, self.log)
         self.countdown = ScanCountdown(self.config, self.events)
         self.tasks = Tasks(self.config_path, folder, self.events)
-        self.throttle = LoginThrottle()
+        self.throttle, self.checking = LoginThrottle(), threading.BoundedSemaphore(AT_ONCE)
         self.heart = Heartbeat(self.config.runtime.folder, "console")
 
     def start(self) -> None:
@@ -176,6 +178,11 @@ IdempotencyKey = Annotated[
 ]
 
 
+def key_of(caller: str, key: str) -> str:
+    """An idempotency key as it is kept: each caller has its own."""
+    return hashlib.sha256(f"{caller}\0{key}".encode()).hexdigest()
+
+
 def once(console: Console, caller: Caller, key: str | None, request: str, answer: str) -> str:
     """The answer recorded for a key: `answer` if the key is new, else the first answer.
 
@@ -184,7 +191,7 @@ def once(console: Console, caller: Caller, key: str | None, request: str, answer
     """
     if key is None:
         return answer
-    digest = hashlib.sha256(f"{caller.name}\0{key}".encode()).hexdigest()
+    digest = key_of(caller.name, key)
     body = hashlib.sha256(request.encode()).hexdigest()
     first_body, first_answer = console.vault.remember(digest, body, answer)
     if first_body != body:

@@ -47,7 +47,7 @@ _MEANINGS = {
     416: "The range lies outside the file",
     421: "The console is not known by this host name",
     422: "A value is missing or invalid",
-    429: "Too many wrong passwords; Retry-After says how long to wait",
+    429: "Too many passwords, wrong or at once; Retry-After says how long to wait",
     431: "The headers are too large",
     503: "No station is responding",
 }
@@ -91,6 +91,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        if error.status_code == HTTPStatus.BAD_REQUEST:
+            # A body that is no JSON at all, or too deep; other bodies are refused in the same way.
+            return _answer(422, "invalid", str(error.detail))
         kind = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http")
         detail = f"{request.method} {request.url.path}: {error.detail}"
         headers = dict(error.headers) if error.headers else None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 
-from station.archive.records import ScanRecord, ScanState
+from station.archive.records import ScanRecord, ScanState, moment_of
 from station.booth.retention import purge_scan
 from station.console.api.console import (
     Booth,
@@ -19,6 +18,7 @@ from station.console.api.console import (
     Reader,
     ScanId,
     Scanner,
+    key_of,
     once,
 )
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
@@ -29,6 +29,8 @@ from station.messaging.messages import Request
 router = APIRouter(prefix="/scans", tags=["scans"])
 _ON_DISK = ("accepted", "reconstructing", "delivered", "rescan")
 _MAX_LABEL_LENGTH = 1000
+_TAKEN_UP_S = 60.0
+"""A scan that nobody knows of so long after it was asked for was deleted, or refused."""
 
 
 @router.get("", responses=responses())
@@ -62,7 +64,7 @@ def list_scans(
     return ScanPage(scans=[of_record(record) for record in found], next=following)
 
 
-@router.post("", status_code=202, responses=responses(409))
+@router.post("", status_code=202, responses=responses(404, 409))
 def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Scan:
     """Take a scan. With an Idempotency-Key the same request never scans twice."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -70,17 +72,33 @@ def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = N
     scan_id = once(console, caller, key, body.model_dump_json(), fresh)
     if scan_id != fresh:
         # Repeated request: a finished scan is not taken again even if the station has forgotten it.
-        with suppress(ProblemError):
+        try:
             return _state(console, scan_id)
+        except ProblemError:
+            # Not taken up yet: the same id is one scan, however often the station is told.
+            if _age_s(scan_id) > _TAKEN_UP_S:
+                # Deleted since: it is not begun again.
+                raise
     console.audit.note(caller.name, caller.address, "scan", scan_id)
-    session = console.countdown.begin(scan_id, body.label, body.countdown_s)
-    return _of_session(session)
+    try:
+        return _of_session(console.countdown.begin(scan_id, body.label, body.countdown_s))
+    except RefusedError:
+        # Nothing was begun: the same request may be sent again when the reason is gone.
+        if key is not None:
+            console.vault.forget(key_of(caller.name, key))
+        raise
 
 
 @router.get("/{scan_id}", responses=responses(404))
 def state(scan_id: ScanId, console: Booth, caller: Reader) -> Scan:  # noqa: ARG001
     """A scan's state, from the countdown to the result, with its timings."""
     return _state(console, scan_id)
+
+
+def _age_s(scan_id: str) -> float:
+    """Seconds since a scan id was made."""
+    made = datetime.fromisoformat(moment_of(scan_id))
+    return (datetime.now(UTC) - made).total_seconds()
 
 
 def _state(console: Console, scan_id: str) -> Scan:

@@ -77,6 +77,9 @@ class EventLog:
                 return self._number, False
             if start != self.start or not number.isascii() or not number.isdigit():
                 return self._number, True
+            if int(number) > self._number:
+                # Never given: waiting for it would be waiting for ever.
+                return self._number, True
             return int(number), int(number) + 1 < oldest
 
     async def stream(self, last_id: str, follow: bool = True) -> AsyncIterator[bytes]:

@@ -8,6 +8,8 @@ FREE_TRIES = 5
 """Tries without a pause: a person mistypes, a program tries thousands."""
 LONGEST_PAUSE_S = 60.0
 _ADDRESSES_KEPT = 1000
+AT_ONCE = 2
+"""Passwords that are checked at the same time, whoever sends them: each takes 64 MiB (argon2)."""
 
 
 class LoginThrottle:

@@ -171,6 +171,10 @@ class Vault:
         found = self._run("SELECT request, answer FROM keys WHERE key = ?", key)[0]
         return str(found[0]), str(found[1])
 
+    def forget(self, key: str) -> None:
+        """Free an idempotency key: what it asked for was refused."""
+        self._run("DELETE FROM keys WHERE key = ?", key)
+
 
 def _token(row: tuple[object, ...]) -> Token:
     name, scopes, made, expires = row
