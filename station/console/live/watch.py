@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from station.archive.index import ScanIndex
 from station.archive.records import PLACES, ScanRecord
@@ -19,7 +20,7 @@ from station.core.config import BoothConfig
 from station.core.errors import BoothError
 from station.core.spool import Spool
 from station.messaging.messages import CameraHealth, Request, ScanEvent
-from station.messaging.transport import subscriber
+from station.messaging.transport import endpoint, subscriber
 
 _POLL_MS = 50
 _SPOOL_S = 0.1
@@ -105,12 +106,19 @@ class Watch:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         sources = ["events", *(f"camera-{name}" for name in self._cameras)]
         incoming = subscriber(context, self._config.runtime.folder, sources, ["scan", "health"])
+        ends = incoming.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        poller = zmq.Poller()
+        poller.register(incoming, zmq.POLLIN)
+        poller.register(ends, zmq.POLLIN)
         looked_s = 0.0
         while not self._stop.is_set():
             self._round_s = time.monotonic()
             try:
-                if incoming.poll(_POLL_MS):
+                ready = dict(poller.poll(_POLL_MS))
+                if incoming in ready:
                     self._receive(*incoming.recv_multipart())
+                if ends in ready:
+                    self._hear_end(recv_monitor_message(ends)["endpoint"].decode())
                 now_s = time.monotonic()
                 if now_s - looked_s > _SPOOL_S:
                     looked_s = now_s
@@ -121,7 +129,14 @@ class Watch:
                 self._log.warning("watching the booth: %s", error)
                 self._problem = f"the booth cannot be watched ({error}); retrying"
                 self._stop.wait(1.0)
+        incoming.disable_monitor()
         context.destroy(linger=0)
+
+    def _hear_end(self, address: str) -> None:
+        """A process closed its socket, or the kernel did when it died: known before its silence."""
+        for camera in self._cameras.values():
+            if address == endpoint(self._config.runtime.folder, f"camera-{camera.name}"):
+                self._set_dead(camera)
 
     def _receive(self, topic: bytes, packed: bytes) -> None:
         if topic == b"scan":
@@ -146,12 +161,15 @@ class Watch:
     def _watch_silence(self, now_s: float) -> None:
         for camera in self._cameras.values():
             if camera.state != "dead" and now_s - camera.heard_s > _SILENT_S:
-                camera.state = "dead"
-                camera.detail = (
-                    "its capture process is not responding and is restarted automatically; if "
-                    "this persists, unplug the camera's USB cable for five seconds"
-                )
-                self._events.append("camera", camera.document())
+                self._set_dead(camera)
+
+    def _set_dead(self, camera: CameraState) -> None:
+        camera.state = "dead"
+        camera.detail = (
+            "its capture process is not responding and is restarted automatically; if "
+            "this persists, unplug the camera's USB cable for five seconds"
+        )
+        self._events.append("camera", camera.document())
 
     def _watch_spool(self) -> None:
         folder = self._config.spool.folder
