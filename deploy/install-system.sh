@@ -1,9 +1,9 @@
 #!/bin/sh
-# Install the Debian packages of apt-packages.txt where this user may; say what is missing otherwise.
-# Usage: install-system.sh [python]
+# Install a list of Debian packages where this user may; say what is missing otherwise.
+# Usage: install-system.sh [python [list]]
 set -eu
 python=${1:-python3}
-list=$(dirname "$0")/apt-packages.txt
+list=${2:-$(dirname "$0")/apt-packages.txt}
 
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || {
     echo "error: $python is not Python 3.11 or newer; name another one: make PYTHON=python3.11 ..." >&2
@@ -34,6 +34,6 @@ else
 fi
 echo "installing Debian packages:$missing"
 export DEBIAN_FRONTEND=noninteractive
-# A failure is not the end: recordings are then read without libfreenect.
+# A failure is not the end: recordings are read without libfreenect, and tests say what they lack.
 { $as_root apt-get update -qq && $as_root apt-get install -y -qq --no-install-recommends $missing; } \
     >/dev/null || echo "note: apt-get could not install:$missing" >&2

@@ -1,52 +1,59 @@
 """The page in Debian's chromium against a real station: what an operator does, and what goes wrong.
 
-`make test-console` runs it: pytest finds it only when it is named, since it needs a browser.
+`make test-console` runs it: pytest finds it only when it is named; test_page.py is its short form.
 Pictures of every view go to the folder that CONSOLE_PICTURES names.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from live_console import API, PASSWORD, LiveConsole
-from playwright.sync_api import BrowserContext, Locator, Page, expect, sync_playwright
+from console_page import (
+    LONG_MS,
+    browser,
+    four_pictures_move,
+    log_in,
+    more_frames,
+    open_view,
+    tablet,
+    wait_for_value,
+)
+from live_console import API, LiveConsole
+from playwright.sync_api import BrowserContext, Page, expect
 
 AXE = Path(__file__).parent / "node_modules/axe-core/axe.min.js"
-_SIZE = {"width": 1024, "height": 768}
-_ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-]  # fmt: skip
-_LONG_MS = 60_000
+_NOTE_REMEDY = """() => {
+  const shown = document.querySelector('[data-camera=back-upper] .remedy');
+  new MutationObserver(() => {
+    if (!shown.hidden) window.remedy ??= { text: shown.textContent, at_ms: Date.now() };
+  }).observe(shown, { attributes: true, childList: true });
+}"""
+_REMEDY_S = 2.0
+"""Bar: so soon after a camera ended the operator reads what to do."""
 
 
 @pytest.fixture(scope="module")
 def context(console: LiveConsole, scans: list[dict[str, Any]]) -> Iterator[BrowserContext]:
     """A tablet that is logged in."""
     assert scans
-    chromium = shutil.which("chromium")
-    assert chromium, "chromium is missing; make test-console installs it where it may"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
-        tablet = browser.new_context(viewport=_SIZE, has_touch=True, locale="en-GB")  # type: ignore[arg-type]
-        page = tablet.new_page()
+    with browser() as started:
+        opened = tablet(started)
+        page = opened.new_page()
         page.goto(console.url)
         page.fill("#password", "wrong password")
         page.click("#login")
         expect(page.get_by_role("alert")).to_contain_text("wrong")
         _picture(page, "login")
-        page.fill("#password", PASSWORD)
-        page.click("#login")
-        expect(page.locator("#rail")).to_be_visible()
+        log_in(page, console)
         page.close()
-        yield tablet
-        browser.close()
+        yield opened
 
 
 @pytest.fixture
@@ -68,19 +75,6 @@ def _picture(page: Page, name: str) -> None:
         page.screenshot(path=str(Path(folder) / f"{name}.png"))
 
 
-def _open(page: Page, console: LiveConsole, view: str) -> None:
-    page.goto(f"{console.url}/#/{view}")
-
-
-def _more_frames(card: Locator, count: int) -> None:
-    """Wait for so many more pictures of a camera."""
-    wanted = int(card.get_attribute("data-frames") or 0) + count
-    deadline_s = time.monotonic() + 60.0
-    while int(card.get_attribute("data-frames") or 0) < wanted:
-        assert time.monotonic() < deadline_s, "no new pictures"
-        time.sleep(0.1)
-
-
 def _accessible(page: Page) -> None:
     """axe-core finds nothing serious."""
     page.evaluate(AXE.read_text())
@@ -94,26 +88,7 @@ def _accessible(page: Page) -> None:
 
 
 def test_four_moving_pictures(page: Page, console: LiveConsole) -> None:
-    _open(page, console, "booth")
-    cards = page.locator("[data-camera]")
-    expect(cards).to_have_count(4)
-    for index in range(4):
-        expect(cards.nth(index)).to_have_attribute("data-state", "streaming", timeout=20_000)
-    for index in range(4):
-        _more_frames(cards.nth(index), 5)
-    moving = page.evaluate(
-        """async () => {
-          const canvas = document.querySelector('[data-camera] canvas');
-          const pixels = () => canvas.getContext('2d').getImageData(0, 0, 320, 240).data;
-          const before = pixels();
-          for (let tries = 0; tries < 20; tries += 1) {
-            await new Promise((resolve) => setTimeout(resolve, 200));
-            if (pixels().some((value, i) => value !== before[i])) return true;
-          }
-          return false;
-        }"""
-    )
-    assert moving
+    four_pictures_move(page, console)
     _picture(page, "booth")
     _accessible(page)
 
@@ -126,7 +101,7 @@ def test_a_scan_from_the_label_to_the_verdict(
     expect(person.locator("svg")).to_be_visible()
     _picture(person, "person-guide")
     _accessible(person)
-    _open(page, console, "scan")
+    open_view(page, console, "scan")
     page.fill("#label", "Order 77")
     _picture(page, "scan")
     _accessible(page)
@@ -134,26 +109,26 @@ def test_a_scan_from_the_label_to_the_verdict(
     expect(person.locator("body")).to_have_attribute("data-screen", "countdown")
     _picture(person, "person-countdown")
     _picture(page, "scan-countdown")
-    expect(page.locator("#leave")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#leave")).to_be_visible(timeout=LONG_MS)
     expect(person.locator("body")).to_have_attribute("data-screen", "free")
     _picture(person, "person-free")
-    expect(page.locator("#verdict")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#verdict")).to_be_visible(timeout=LONG_MS)
     assert page.locator("#verdict").get_attribute("data-verdict") in ("ok", "rescan")
     _picture(page, "scan-verdict")
     _accessible(page)
     # One tap scans the same order again; then it is given up.
     page.click("#again")
     page.click("#give-up")
-    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "failed", timeout=_LONG_MS)
+    expect(page.locator("#verdict")).to_have_attribute("data-verdict", "failed", timeout=LONG_MS)
     person.close()
 
 
 def test_a_result_turns_and_lights_up(
     page: Page, console: LiveConsole, scans: list[dict[str, Any]]
 ) -> None:
-    _open(page, console, f"result/{scans[0]['scan_id']}")
+    open_view(page, console, f"result/{scans[0]['scan_id']}")
     canvas = page.locator("canvas[data-ready=yes]")
-    expect(canvas).to_be_visible(timeout=_LONG_MS)
+    expect(canvas).to_be_visible(timeout=LONG_MS)
     eye = canvas.get_attribute("data-eye")
     box = canvas.bounding_box()
     assert box is not None
@@ -191,9 +166,9 @@ def test_a_result_turns_and_lights_up(
 def test_a_touched_line_finds_its_row(
     page: Page, console: LiveConsole, scans: list[dict[str, Any]]
 ) -> None:
-    _open(page, console, f"result/{scans[0]['scan_id']}")
+    open_view(page, console, f"result/{scans[0]['scan_id']}")
     canvas = page.locator("canvas[data-ready=yes]")
-    expect(canvas).to_be_visible(timeout=_LONG_MS)
+    expect(canvas).to_be_visible(timeout=LONG_MS)
     expect(page.locator("#rows tr").first).to_be_visible()
     box = canvas.bounding_box()
     assert box is not None
@@ -207,7 +182,7 @@ def test_a_touched_line_finds_its_row(
 
 def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> None:
     """A stored script must not run: a dialog would fail the page."""
-    _open(page, console, "history")
+    open_view(page, console, "history")
     page.fill("#search", "<script>")
     row = page.locator("tr[data-scan]", has_text="<script>alert(1)</script>")
     expect(row).to_be_visible()
@@ -217,7 +192,7 @@ def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> N
 
 def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
     gone = console.scan("to be deleted")
-    _open(page, console, "history")
+    open_view(page, console, "history")
     expect(page.locator("tr[data-scan]").nth(2)).to_be_visible()
     _picture(page, "history")
     _accessible(page)
@@ -225,11 +200,11 @@ def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
     done.nth(0).check()
     done.nth(1).check()
     page.click("#compare")
-    expect(page.locator("#compared tbody tr").nth(40)).to_be_attached(timeout=_LONG_MS)
-    expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#compared tbody tr").nth(40)).to_be_attached(timeout=LONG_MS)
+    expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
     _picture(page, "compare")
     _accessible(page)
-    _open(page, console, "history")
+    open_view(page, console, "history")
     row = page.locator(f"tr[data-scan='{gone['scan_id']}']")
     row.get_by_role("button", name="Delete").click()
     _picture(page, "delete")
@@ -239,45 +214,60 @@ def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
 
 
 def test_a_calibration_step_from_recordings(page: Page, console: LiveConsole) -> None:
-    _open(page, console, "calibration")
+    open_view(page, console, "calibration")
     expect(page.locator("#now")).to_be_visible()
     _accessible(page)
     page.click("button[data-step=floor]")
-    expect(page.locator("#halt")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#halt")).to_be_visible(timeout=LONG_MS)
     _picture(page, "calibration-running")
-    expect(page.locator("#log")).to_contain_text("empty booth kept", timeout=_LONG_MS)
-    expect(page.locator("#calibrate")).to_be_visible(timeout=_LONG_MS)
+    # Every frame is looked at, whatever else the machine does.
+    expect(page.locator("#log")).to_contain_text("empty booth kept", timeout=5 * LONG_MS)
+    expect(page.locator("#calibrate")).to_be_visible(timeout=LONG_MS)
     _picture(page, "calibration")
     page.click("button[data-step=solve]")
-    expect(page.locator("#task-error")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#task-error")).to_be_visible(timeout=LONG_MS)
 
 
-def test_a_lost_camera_is_told_within_two_seconds(page: Page, console: LiveConsole) -> None:
-    _open(page, console, "booth")
+def test_a_killed_camera_is_told_with_its_remedy(page: Page, console: LiveConsole) -> None:
+    open_view(page, console, "booth")
     card = page.locator("[data-camera=back-upper]")
     expect(card).to_have_attribute("data-state", "streaming", timeout=20_000)
+    # The supervisor has it back soon: what the page showed in between is noted by the page itself.
+    page.evaluate(_NOTE_REMEDY)
+    os.kill(console.station.pids("capture", "back-upper")[0], signal.SIGKILL)
+    began_s = time.time()
+    remedy = wait_for_value(page, "window.remedy")
+    assert "capture process" in remedy["text"]
+    seconds = remedy["at_ms"] / 1e3 - began_s
+    met = "met" if seconds < _REMEDY_S else "missed"
+    print(f"\na killed camera's remedy: {seconds:.2f} s (bar: {_REMEDY_S:g} s): {met}")
+    expect(card).to_have_attribute("data-state", "streaming", timeout=LONG_MS)
+
+
+def test_a_camera_that_hangs_is_told_with_its_remedy(page: Page, console: LiveConsole) -> None:
+    open_view(page, console, "booth")
+    card = page.locator("[data-camera=back-upper]")
+    expect(card).to_have_attribute("data-state", "streaming", timeout=LONG_MS)
     victim = console.station.pids("capture", "back-upper")[0]
-    # Stopped and not killed: the supervisor would have it back before anybody could look.
     os.kill(victim, signal.SIGSTOP)
-    began_s = time.monotonic()
     try:
-        expect(card.locator(".remedy")).to_contain_text("capture process", timeout=20_000)
-        print(f"a lost camera and its remedy: {time.monotonic() - began_s:.2f} s")
+        expect(card.locator(".remedy")).to_contain_text("capture process", timeout=LONG_MS)
         _picture(page, "booth-lost-camera")
         _accessible(page)
     finally:
-        os.kill(victim, signal.SIGCONT)
-    expect(card).to_have_attribute("data-state", "streaming", timeout=_LONG_MS)
+        with suppress(ProcessLookupError):
+            os.kill(victim, signal.SIGCONT)
+    expect(card).to_have_attribute("data-state", "streaming", timeout=LONG_MS)
 
 
 def test_a_lost_console_comes_back_by_itself(page: Page, console: LiveConsole) -> None:
-    _open(page, console, "booth")
+    open_view(page, console, "booth")
     expect(page.locator("[data-camera]").first).to_be_visible()
     os.kill(console.station.pids("console")[0], signal.SIGKILL)
-    expect(page.locator("#lost")).to_be_visible(timeout=_LONG_MS)
+    expect(page.locator("#lost")).to_be_visible(timeout=LONG_MS)
     _picture(page, "console-lost")
-    expect(page.locator("#lost")).to_have_count(0, timeout=_LONG_MS)
-    _more_frames(page.locator("[data-camera]").first, 3)
+    expect(page.locator("#lost")).to_have_count(0, timeout=LONG_MS)
+    more_frames(page.locator("[data-camera]").first, 3)
     # The session outlived the console: nobody was asked to log in again.
     expect(page.locator("#password")).to_have_count(0)
 
@@ -287,7 +277,7 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     page.select_option("#language", "zh")
     expect(page.locator("h1")).to_have_text("扫描", timeout=20_000)
     assert page.evaluate("document.documentElement.lang") == "zh-CN"
-    _open(page, console, f"result/{scans[0]['scan_id']}")
+    open_view(page, console, f"result/{scans[0]['scan_id']}")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
     _picture(page, "result-zh")
     page.select_option("#language", "en")

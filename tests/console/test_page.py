@@ -1,0 +1,31 @@
+"""The page in Debian's chromium, in short: an operator logs in, looks, scans and reads the result.
+
+page_in_browser.py has every other view and what goes wrong; `make test-console` runs it.
+"""
+
+from __future__ import annotations
+
+from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
+from live_console import LiveConsole
+from playwright.sync_api import expect
+
+
+def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> None:
+    errors: list[str] = []
+    with browser() as started:
+        page = tablet(started).new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        log_in(page, console)
+        four_pictures_move(page, console)
+        open_view(page, console, "scan")
+        page.fill("#label", "Order 5")
+        page.click("#go")
+        verdict = page.locator("#verdict")
+        expect(verdict).to_be_visible(timeout=5 * LONG_MS)
+        assert verdict.get_attribute("data-verdict") in ("ok", "rescan"), verdict.inner_text()
+        page.click("#open")
+        expect(page.locator("h1")).to_have_text("Order 5", timeout=LONG_MS)
+        expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
+        page.click("tr[data-name=waist_girth]")
+        expect(page.locator("#line-name")).to_contain_text("Waist girth")
+    assert errors == []
