@@ -124,6 +124,8 @@ def _configure(root: Path) -> None:
     """Do what the packages' scripts would: accounts, alternatives, the linker's cache."""
     for folder in ("dev", "proc", "sys", "run", "root", "opt", "srv", "media", "var/lib/apt/lists"):
         (root / folder).mkdir(parents=True, exist_ok=True)
+    # Debian's own timers, which are not enabled here, leave their stamps in it.
+    (root / "var/lib/systemd/timers").mkdir(parents=True, exist_ok=True)
     (root / "tmp").chmod(0o1777)
     for name in ("passwd", "group"):
         shutil.copy(root / f"usr/share/base-passwd/{name}.master", root / f"etc/{name}")
