@@ -32,10 +32,13 @@ demo: $(VENV)/runtime.stamp
 test: $(VENV)/train.stamp $(VENV)/chromium.stamp
 	$(BIN)/python -m pytest $(PARALLEL) --durations=20
 
+# Faults at file calls are injected by a small library in C.
 test-faults: $(VENV)/dev.stamp
+	command -v cc >/dev/null || apt-get install -y --no-install-recommends gcc libc6-dev
 	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py $(ARGS)
 
 soak: $(VENV)/dev.stamp
+	command -v cc >/dev/null || apt-get install -y --no-install-recommends gcc libc6-dev
 	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long --minutes 60 $(ARGS)
 
 # The console in Debian's chromium; long: requests generated from its OpenAPI document.

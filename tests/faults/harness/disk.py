@@ -1,168 +1,186 @@
-"""A scan's way through the spool, cut at every call that changes the disk.
+"""Lives of scans, results and calibrations, cut at every call that the disk sees.
 
-Each run is a process of its own, forked from a warm one, that ends (or meets an errno) at its n-th
-call of open, write, fsync, rename, mkdir or unlink. A new process goes on from what is on disk.
+Run as a program with `faults.c` loaded (`disk_rows` does so): each point is a process of its own,
+forked from a warm one, that is killed, or meets an errno, at its n-th file call. New processes go
+on from what is on disk.
 """
 
 from __future__ import annotations
 
-import builtins
 import errno
+import json
 import os
-import shutil
-import signal
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
+import lives
+from injection import ERRNOS, Action, Injection, build, environment
 from table import Row
 
-from station.core.scans import ScanId, ScanNote
-from station.core.spool import Spool
-
-_CALLS = ("open", "write", "fsync", "rename", "replace", "mkdir", "unlink", "rmdir", "ftruncate")
-_ERRORS = (errno.EIO, errno.ENOSPC, errno.EROFS, errno.EPERM, errno.EMFILE)
-_ID = ScanId("20260101T000000Z-0001")
+_ROLE = "cut-lives"
+_TRIES = 3
+"""Processes that go on, one after the other, once the disk is well again."""
 
 
-def _inject(at: int, act: Callable[[], None]) -> Callable[[], int]:
-    """Call `act` before the at-th changing call; returns how many calls there were so far."""
-    count = 0
+@dataclass(frozen=True, slots=True)
+class Life:
+    """Something that is written, and how to tell whether it is there as it should be."""
 
-    def counted(real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            nonlocal count
-            count += 1
-            if count == at:
-                act()
-            return real(*args, **kwargs)
-
-        return call
-
-    for name in _CALLS:
-        setattr(os, name, counted(getattr(os, name)))
-    builtins.open = counted(builtins.open)
-    import io
-
-    io.open = builtins.open
-    return lambda: count
+    name: str
+    live: Callable[[Path], None]
+    prepare: Callable[[Path], object]
+    sound: Callable[[Path], bool]
+    """At any time."""
+    ended: Callable[[Path], bool]
+    """At the end."""
 
 
-def _live(folder: Path, *, retries: int = 2) -> None:
-    """A scan's whole life: order, bundle, claim, result, moved away."""
-    spool = Spool(folder)
-    if spool.notes.read(_ID) is None and spool.where(_ID) is None:
-        spool.notes.write(ScanNote(_ID, "capturing"), durable=False)
-    if spool.where(_ID) is None and spool.note(_ID).stage == "capturing":
-        bundle = spool.temporary(_ID)
-        bundle.mkdir()
-        for index in range(3):
-            (bundle / f"{index}.png").write_bytes(b"frame" * 100)
-        (bundle / "bundle.json").write_text("whole")
-        spool.submit(bundle, _ID)
-    spool.recover(retries)
-    while (claim := spool.claim()) is not None:
-        result = spool.temporary(_ID)
-        result.mkdir()
-        for name in ("mesh.ply", "result.json"):
-            (result / name).write_text("whole" * 50)
-        try:
-            claim.deliver(result, "ok")
-        except OSError:
-            claim.release()
-            raise
+def _scan(name: str, write_result: Callable[[Path], None], moved: bool) -> Life:
+    """A scan whose result is taken from the outbox at once, or only at the end."""
+    taken: dict[Path, int] = {}
+
+    def sound(folder: Path) -> bool:
+        taken[folder] = lives.delivered(folder) if moved else 0
+        return taken[folder] <= 1 and lives.kept_bundles(folder) <= 1
+
+    def ended(folder: Path) -> bool:
+        once = taken.get(folder, 0) + lives.delivered(folder) == 1
+        return once and lives.kept_bundles(folder) == 1
+
+    return Life(name, lambda f: lives.scan(f, write_result), lambda _: None, sound, ended)
 
 
-def _take(folder: Path) -> int:
-    """The fitting room: results that it finds in the outbox, moved away; torn ones count 100."""
-    taken = 0
-    room = folder.parent / "room"
-    room.mkdir(exist_ok=True)
-    for result in (folder / "outbox").glob("*"):
-        whole = {p.name: p.read_text() for p in result.iterdir()}
-        taken += 1 if len(whole) == 2 and all(t == "whole" * 50 for t in whole.values()) else 100
-        shutil.move(result, room / f"{result.name}.{len(list(room.iterdir()))}")
-    return taken
+def _lives(real: bool) -> list[Life]:
+    found = [
+        _scan("scan", lives.small_result, moved=False),
+        _scan("scan, result taken away", lives.small_result, moved=True),
+        Life(
+            "calibration", lives.calibration, lives.first_calibration, lives.calibrated,
+            lives.finished,
+        ),
+    ]  # fmt: skip
+    if real:
+        found.insert(1, _scan("scan with a body's result", lives.real_result(), moved=False))
+    return found
 
 
-def _child(folder: Path, at: int, act: Callable[[], None]) -> tuple[bool, int]:
-    """Live a scan in a process with a fault; whether it got through, and its number of calls."""
-    reading, writing = os.pipe()
+def _process(live: Callable[[Path], None], folder: Path) -> None:
+    """Live in a process of its own."""
     pid = os.fork()
     if pid == 0:
-        os.close(reading)
-        report = os.write
-        calls = _inject(at, act)
         code = 1
         try:
-            _live(folder)
+            quiet = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(quiet, 2)
+            live(folder)
             code = 0
-        except OSError:
-            pass
         finally:
-            report(writing, str(calls()).encode())
             os._exit(code)
-    os.close(writing)
-    _, status = os.waitpid(pid, 0)
-    with os.fdopen(reading) as said:
-        text = said.read()
-    return status == 0, int(text or 0)
+    os.waitpid(pid, 0)
 
 
-def _die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+class _Cutter:
+    """Cuts lives at chosen calls."""
+
+    def __init__(self, injection: Injection) -> None:
+        self._injection = injection
+
+    def calls(self, life: Life, *, changes: bool) -> int:
+        """Number of file calls of an undisturbed life."""
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            life.prepare(folder)
+            self._injection.arm(folder, "count", changes=changes)
+            _process(life.live, folder)
+            self._injection.disarm()
+            if not life.ended(folder):
+                raise RuntimeError(f"an undisturbed {life.name} does not end as it should")
+            return self._injection.calls
+
+    def well(self, life: Life, at: int, action: Action, value: int, *, changes: bool) -> bool:
+        """Whether a life that met a fault at its n-th call is whole, and ends as it should."""
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            life.prepare(folder)
+            self._injection.arm(folder, action, value, first=at, count=1, changes=changes)
+            _process(life.live, folder)
+            self._injection.disarm()
+            sound = life.sound(folder)
+            for _ in range(_TRIES):
+                _process(life.live, folder)
+            well = sound and life.ended(folder)
+            if not well:
+                where = f"{life.name}: {action} {value} at {at} ({self._injection.last_call})"
+                print(
+                    f"{where}: {'torn' if not sound else 'not whole at the end'}", file=sys.stderr
+                )
+            return well
 
 
-def _raise(code: int) -> Callable[[], None]:
-    def act() -> None:
-        raise OSError(code, os.strerror(code))
-
-    return act
-
-
-def _one(at: int, act: Callable[[], None], moved_between: bool) -> tuple[int, bool, int]:
-    """Results that were delivered in all, whether one try was enough, and the calls there were."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "spool"
-        Spool(folder)
-        through, calls = _child(folder, at, act)
-        delivered = _take(folder) if moved_between else 0
-        for _ in range(3):
-            _child(folder, 0, _die)
-        return delivered + _take(folder), through, calls
-
-
-def disk_rows(every: int) -> list[Row]:
-    """Cut a scan's life at every n-th changing call, by SIGKILL and by each errno."""
-    _, _, calls = _one(0, _die, False)
-    killed = wrong = 0
-    for moved_between in (False, True):
-        for at in range(1, calls + 1, every):
-            delivered, _, _ = _one(at, _die, moved_between)
-            killed += 1
-            wrong += delivered != 1
+def _cut(cutter: _Cutter, every: int, real: bool) -> list[Row]:
+    found = _lives(real)
+    kills = {life.name: cutter.calls(life, changes=False) for life in found}
+    wrong = points = 0
+    for life in found:
+        for at in range(1, kills[life.name] + 1, every):
+            points += 1
+            wrong += not cutter.well(life, at, "kill", 0, changes=False)
     rows = [
         Row(
-            "kill at a write, fsync, rename of the spool",
+            "kill at a file call",
             "0 torn, lost, doubled",
-            f"{killed} points of {2 * calls}, {wrong} wrong",
+            f"{points} points of {sum(kills.values())} "
+            f"({', '.join(f'{name}: {calls}' for name, calls in kills.items())}), {wrong} wrong",
             wrong == 0,
         )
     ]
-    failed = wrong = 0
-    for code in _ERRORS:
-        for at in range(1, calls + 1, every):
-            delivered, _, _ = _one(at, _raise(code), True)
-            failed += 1
-            wrong += delivered != 1
-    names = ", ".join(errno.errorcode[code] for code in _ERRORS)
+    wrong = points = 0
+    plain = [life for life in found if life.name != "scan"] if real else found
+    for life in plain:
+        calls = cutter.calls(life, changes=False)
+        for code in ERRNOS:
+            for at in range(1, calls + 1, every):
+                points += 1
+                wrong += not cutter.well(life, at, "fail", code, changes=False)
+    names = ", ".join(errno.errorcode[code] for code in ERRNOS)
     rows.append(
         Row(
-            "an errno at a file call of the spool",
-            "the scan delivered once all the same",
-            f"{failed} points ({names}), {wrong} wrong",
+            "an errno at a file call of their writers",
+            "whole, and as it should be in the end",
+            f"{points} points ({names}), {wrong} wrong",
             wrong == 0,
         )
     )
     return rows
+
+
+def disk_rows(every: int, real: bool) -> list[Row]:
+    """Cut every life at every n-th call, by SIGKILL and by each errno.
+
+    Args:
+        real: with the files of a fitted body, too.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        library = build(folder)
+        Injection(folder, _ROLE)
+        variables = environment(library, folder, [_ROLE])
+        done = subprocess.run(
+            [sys.executable, __file__, _ROLE, str(folder), str(every), str(int(real))],
+            env={**os.environ, **variables}, stdout=subprocess.PIPE, check=True,
+        )  # fmt: skip
+    return [Row(**row) for row in json.loads(done.stdout.splitlines()[-1])]
+
+
+def main() -> None:
+    folder, every, real = Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "1"
+    rows = _cut(_Cutter(Injection(folder, _ROLE)), every, real)
+    print(json.dumps([asdict(row) for row in rows]))
+
+
+if __name__ == "__main__":
+    main()

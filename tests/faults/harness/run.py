@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from clocks import property_rows
 from disk import disk_rows
-from fuzz import bundle_rows, message_rows
+from fuzz import intake_rows, message_rows
+from fuzz_files import file_rows
 from processes import (
     full_disk_rows,
     job_rows,
@@ -33,7 +35,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kills", type=int, help="kill -9 so many times")
     parser.add_argument(
-        "--only", choices=["disk", "fuzz", "processes"], help="this part of the table alone"
+        "--only",
+        choices=["disk", "fuzz", "clocks", "processes"],
+        help="this part of the table alone",
     )
     parser.add_argument("--minutes", type=float, default=0.0, help="of soaking, after the faults")
     arguments = parser.parse_args()
@@ -49,11 +53,15 @@ def main() -> int:
         print(f"        ({part}: {time.monotonic() - began_s:.0f} s)", flush=True)
 
     if arguments.only in (None, "disk"):
-        show("disk", lambda: disk_rows(every=1 if long else 7))
+        show("disk", lambda: disk_rows(every=1 if long else 25, real=long))
     if arguments.only in (None, "fuzz"):
         count = 1_000_000 if long else 10_000
         show("messages", lambda: message_rows(count, arguments.seed))
-        show("bundles", lambda: _fuzzed_bundles(100_000 if long else 300, arguments.seed))
+        show("intake", lambda: intake_rows(50_000 if long else 2_000, arguments.seed))
+        show("files", lambda: _fuzzed_files(100_000 if long else 300, arguments.seed))
+    if arguments.only in (None, "clocks"):
+        count = 10_000 if long else 200
+        show("clocks", lambda: property_rows(count, arguments.seed))
     if arguments.only in (None, "processes"):
         with _station() as station:
             kills = arguments.kills or (200 if long else 2)
@@ -69,13 +77,13 @@ def main() -> int:
     return 1 if any(long or not row.timed for row in missed) else 0
 
 
-def _fuzzed_bundles(count: int, seed: int) -> list[Row]:
+def _fuzzed_files(count: int, seed: int) -> list[Row]:
     from station.simulation.scene import load_mesh
     from station.simulation.sensor import render_bundle
 
     with tempfile.TemporaryDirectory() as name:
         bundle = render_bundle(load_mesh(BODY), Path(name) / "scan", frames=2)
-        return bundle_rows(bundle, count, seed)
+        return file_rows(bundle, count, seed)
 
 
 @contextmanager

@@ -1,0 +1,203 @@
+"""Lives that are cut at each of their file calls: a scan, a result, a calibration.
+
+A life does as the real processes do, with their own functions. It can be begun again at any point:
+a process that finds what another left behind goes on from there.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from station.calibration.detect.detections import BallDetection
+from station.calibration.guide.session import EMPTY, FRONT, MARK, Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.bundle import CapturedFrame, read_bundle, write_bundle
+from station.core.errors import FormatError
+from station.core.rig import Rig
+from station.core.scans import ScanId, ScanNote
+from station.core.spool import Spool
+from station.simulation.scene import default_rig
+
+_ID = ScanId("20260101T000000Z-0001")
+_CAMERAS = ("front-lower", "back-upper")
+_RETRIES = 2
+
+
+@lru_cache
+def _rig() -> Rig:
+    whole = default_rig()
+    return replace(whole, cameras={name: whole.cameras[name] for name in _CAMERAS})
+
+
+def scan(folder: Path, write_result: Callable[[Path], None]) -> None:
+    """A scan's life: order, bundle, claim, result, delivery."""
+    spool = Spool(folder / "spool")
+    if spool.notes.read(_ID) is None and spool.where(_ID) is None:
+        spool.notes.write(ScanNote(_ID, "capturing"), durable=False)
+    if spool.where(_ID) is None and spool.note(_ID).stage == "capturing":
+        bundle = spool.temporary(_ID)
+        depth = np.full((480, 640), 2000, np.uint16)
+        write_bundle(
+            bundle, scan_id=_ID, created="2026-01-01T00:00:00Z", label="", depth_scale_m=1e-3,
+            rig=_rig(), spread_s_max=0.001,
+            frames={name: [CapturedFrame(depth, 7, 6e7, 5.0, 1)] for name in _CAMERAS},
+        )  # fmt: skip
+        spool.submit(bundle, _ID)
+    spool.recover(_RETRIES)
+    while (claim := spool.claim()) is not None:
+        result = spool.temporary(_ID)
+        result.mkdir()
+        try:
+            write_result(result)
+            claim.deliver(result, "ok")
+        except OSError:
+            claim.release()
+            raise
+
+
+def small_result(folder: Path) -> None:
+    """Two files in the place of a body's nine."""
+    for name in ("mesh.ply", "result.json"):
+        (folder / name).write_text("whole" * 50)
+
+
+def real_result() -> Callable[[Path], None]:
+    """The function that writes a body's result, with a body that is fitted now."""
+    from workers.export.origin import Origin
+    from workers.export.result import write_result
+    from workers.export.stopwatch import Stopwatch
+    from workers.reconstruct import job
+
+    kept: list[Any] = []
+
+    def keep(_: Path, *content: Any) -> None:
+        kept.append(content)
+
+    model = job.warm_up()
+    with mock.patch.object(job, "write_result", keep):
+        job.reconstruct_cloud(job._mean_cloud(model), _ID, Path("unused"), model=model)
+    model, fit, cloud, measured, standing, _, method, _ = kept[0]
+
+    def write(folder: Path) -> None:
+        write_result(
+            folder, model, fit, cloud, measured, standing, Origin(_ID), method, Stopwatch()
+        )
+
+    return write
+
+
+def delivered(folder: Path) -> int:
+    """Results in the outbox, moved away as the fitting room does; torn ones count 100."""
+    room = folder / "room"
+    room.mkdir(exist_ok=True)
+    taken = 0
+    for result in (folder / "spool/outbox").glob("*"):
+        taken += 1 if _whole(result) else 100
+        shutil.move(result, room / f"{result.name}.{len(list(room.iterdir()))}")
+    return taken
+
+
+def _whole(result: Path) -> bool:
+    try:
+        if (result / "mesh.obj").exists():
+            document = json.loads((result / "result.json").read_text())
+            return all((result / name).stat().st_size for name in document["files"])
+        names = {path.name: path.read_text() for path in result.iterdir()}
+    except (OSError, ValueError, KeyError):
+        return False
+    return len(names) == 2 and all(text == "whole" * 50 for text in names.values())
+
+
+def kept_bundles(folder: Path) -> int:
+    """Whole bundles under a final name; torn ones count 100."""
+    count = 0
+    for state in ("queue", "work", "done", "failed"):
+        for bundle in (folder / "spool" / state).glob("*"):
+            try:
+                read = read_bundle(bundle)
+                for camera, frames in read.frames.items():
+                    read.read_frame(camera, frames[0])
+                count += 1
+            except FormatError:
+                count += 100
+    return count
+
+
+_RUNS = 3
+
+
+def calibration(folder: Path) -> None:
+    """A calibration's life: begun, seen step by step, finished, put into use."""
+    store = CalibrationStore(folder / "calibrations", folder / "calibration.json")
+    with store.locked():
+        if store.newest() is None:
+            session = _session(store)
+            _see(session)
+            rig = replace(_rig(), created="2026-01-02T00:00:00Z")
+            store.finish(rig, {"note": "whole"})
+        newest = store.newest()
+        assert newest is not None
+        store.use(newest)
+
+
+def _session(store: CalibrationStore) -> Session:
+    try:
+        return Session.load(store.unfinished)
+    except FormatError:
+        store.set_aside()
+        return Session.begin(store.unfinished, "2026-01-02T00:00:00Z", 0.1, _rig().cameras)
+
+
+def _see(session: Session) -> None:
+    if not session.done(EMPTY):
+        session.keep_empty({}, [])
+    while session.runs < _RUNS:
+        session.begin_run()
+        session.keep_balls([_ball(float(index)) for index in range(5)])
+    for step in (MARK, FRONT):
+        if not session.done(step):
+            session.keep_resting(step, [_ball(0.0)])
+
+
+def _ball(time_s: float) -> BallDetection:
+    covariance = np.eye(3) * 1e-6
+    return BallDetection(
+        _CAMERAS[0], time_s, np.array([0.0, 0.0, 2.0]), covariance, 500, 0.1, 1e-3, np.ones((3, 4))
+    )
+
+
+def calibrated(folder: Path) -> bool:
+    """Whether the booth's calibration can be read, and so can all that was stored or seen."""
+    store = CalibrationStore(folder / "calibrations", folder / "calibration.json")
+    try:
+        Rig.load(store.in_use)
+        store.entries()
+        if (store.unfinished / "session.json").exists():
+            Session.load(store.unfinished)
+    except FormatError:
+        return False
+    return True
+
+
+def finished(folder: Path) -> bool:
+    """Whether the new calibration is stored once, whole, and in use."""
+    store = CalibrationStore(folder / "calibrations", folder / "calibration.json")
+    found = [entry for entry in store.entries() if not entry.name.endswith("-found")]
+    if len(found) != 1 or not found[0].in_use:
+        return False
+    seen = Session.load(found[0].folder)
+    return seen.done(MARK) and seen.done(FRONT) and len(seen.balls) >= 5 and seen.runs >= _RUNS
+
+
+def first_calibration(folder: Path) -> None:
+    """The calibration that the booth had before."""
+    _rig().save(folder / "calibration.json")
