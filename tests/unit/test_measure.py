@@ -283,6 +283,22 @@ def test_a_row_says_whether_cameras_saw_its_line(model: BodyModel) -> None:
     assert {row.basis for row in measure_body(model, model.mean).rows} == {"seen"}
 
 
+def test_a_height_is_seen_where_the_head_was_seen_to_end(model: BodyModel) -> None:
+    """No camera has readings of a crown."""
+    sigma = np.full(model.vertex_count, 1e-3)
+    nothing = np.zeros(model.vertex_count, bool)
+    basis = {
+        crown: {
+            row.name: row.basis
+            for row in measure_body(
+                model, model.mean, sigma, nothing, ScanErrors(crown_sigma_m=crown)
+            ).rows
+        }["height"]
+        for crown in (0.0, 0.008)
+    }
+    assert basis == {0.0: "seen", 0.008: "inferred"}
+
+
 def test_differences_are_left_minus_right(model: BodyModel) -> None:
     taller = model.mean.copy()
     arm = [model.part_names.index(part) for part in ("forearm_left", "hand_left")]

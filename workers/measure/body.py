@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from workers.measure.coverage import Basis, SeenSkin
 from workers.measure.intervals import Pose, ScanErrors, content_interval, intervals, row_values
+from workers.measure.kinds import Top
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
 from workers.scape.model.body_model import BodyModel, BodyState
@@ -122,7 +123,7 @@ def _measured(
             interval,
             trace.path(shown),
             trace.closed,
-            "seen" if skin is None else skin.basis(trace),
+            _basis(skin, trace, scan_errors),
             _parts_of(model, trace),
         )
         for trace, value, interval in zip(
@@ -140,6 +141,17 @@ def _measured(
         Content(volume, content_interval("volume", volume, vertex_sigma_m, pose)),
         Content(surface, content_interval("surface", surface, vertex_sigma_m, pose)),
     )
+
+
+def _basis(skin: SeenSkin | None, trace: Trace, scan_errors: ScanErrors) -> Basis:
+    """The basis of a row. The top of a head counts as seen where the cameras saw the head end, for
+    it gives no readings itself.
+    """
+    if skin is None:
+        return "seen"
+    if isinstance(trace.definition.way, Top):
+        return "inferred" if scan_errors.crown_sigma_m > 0.0 else "seen"
+    return skin.basis(trace)
 
 
 def _parts_of(model: BodyModel, trace: Trace) -> frozenset[str]:
