@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
-from workers.scape.fit.unmatched import unmatched_patches
-from workers.scape.fit.verdict import judge, lost_parts
+from workers.scape.fit.unmatched import unmatched_patches, widened
+from workers.scape.fit.verdict import PartReport, judge, lost_parts
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 
@@ -74,6 +74,27 @@ def test_folds_and_stray_readings_are_no_lost_limb(model: BodyModel) -> None:
     patches = unmatched_patches(model, model.mean, replace(cloud, points=points))
     assert patches
     assert lost_parts(model, patches) == {}
+
+
+def test_a_small_patch_widens_the_skin_beside_it(model: BodyModel) -> None:
+    cloud = _scan_of(model, model.mean)
+    navel = cloud.points[np.argmin(np.linalg.norm(cloud.points - (0.0, -0.2, 1.0), axis=1))]
+    fold = np.linalg.norm(cloud.points - navel, axis=1) < 0.02
+    points = cloud.points - 0.022 * fold[:, None] * cloud.normals
+    patches = unmatched_patches(model, model.mean, replace(cloud, points=points))
+    sigma_m = widened(model, np.full(model.vertex_count, 1e-3), patches)
+    away = np.linalg.norm(model.mean - navel, axis=1)
+    assert (sigma_m[away < 0.015] > 0.012).all()
+    assert (sigma_m[away > 0.2] == 1e-3).all()
+    assert lost_parts(model, patches) == {}
+
+
+def test_a_person_of_whom_one_side_is_missing_is_not_measured(model: BodyModel) -> None:
+    parts = [PartReport("abdomen", 0.48, 1e-3), PartReport("hand_left", 0.85, 1e-3)]
+    sides = {"front": 0.9, "back": 0.02}
+    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    assert found.status == "rescan"
+    assert found.missing == ("abdomen",)
 
 
 def test_something_beside_the_person_is_no_limb(model: BodyModel) -> None:

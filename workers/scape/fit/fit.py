@@ -33,7 +33,7 @@ from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
 from workers.scape.fit.sampling import Sampling
-from workers.scape.fit.unmatched import unmatched_patches
+from workers.scape.fit.unmatched import Patch, unmatched_patches, widened
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
@@ -110,6 +110,8 @@ class OverlappingFit:
     separated."""
     crown_sigma_m: float
     """Standard deviation of the top of the head, in excess of an ordinary scan's."""
+    patches: tuple[Patch, ...]
+    """Patches of the scan that the surface does not explain."""
     cloud: PointCloud
     correspondences: int
     iterations: int
@@ -193,12 +195,15 @@ def fit_overlapping(
         surface = fit_surface(model, reference, cloud, cameras.corrected(joint.rims), crown)
     poses = cameras.poses(scan.views)
     crown_sigma = crown_sigma_m(model, scan.views, poses, surface.vertices, cloud.points)
+    patches = unmatched_patches(model, surface.vertices, cloud)
+    surface = replace(surface, sigma_m=widened(model, surface.sigma_m, patches))
     return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),
         surface=surface,
         reference=reference,
         crown_sigma_m=crown_sigma,
+        patches=patches,
         cloud=cloud,
         correspondences=used,
         iterations=iterations,
@@ -221,7 +226,7 @@ def separate_limbs(
         vertices = untangled(model, vertices, fit.reference, surface.measured)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
-    lost = lost_parts(model, unmatched_patches(model, vertices, fit.cloud))
+    lost = lost_parts(model, fit.patches)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m

@@ -6,6 +6,7 @@ points say less: they mix a lost hand with the folds and the stray readings of a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,15 @@ _MOST_CELLS = 4_000_000
 """A cloud that fills a larger grid (20 x 2 x 2 m) is no body and has no patches."""
 FAR_M = 0.015
 """Distance from which a point is not explained: the folds of real people stay below it."""
+ELSEWHERE_M = 0.15
+"""Distance of a patch from which it is no limb of the person but something else."""
 _SHARE_OF_PATCH = 0.2
 """A patch is of every part that is nearest to at least so much of it."""
+_LEAST_WIDENED_M2 = 0.0005
+"""Area from which a patch is more than a few stray readings: sound scans of the model's own family
+leave 2 cm^2 at most."""
+_WIDENED_RINGS = 3
+"""Rings of vertices around those next to a patch, whose points are thinned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +46,8 @@ class Patch:
     """Median distance to the surface."""
     parts: tuple[int, ...]
     """Indices of the model's parts that are nearest to it, the most frequent first."""
+    vertices: NDArray[np.intp]
+    """Vertices that are nearest to its points."""
 
 
 def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> tuple[Patch, ...]:
@@ -64,10 +74,27 @@ def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> t
             float(area[label == index].sum()),
             float(np.median(away[far][label == index])),
             _parts_of(part[label == index]),
+            np.unique(near[far][label == index]),
         )
         for index in range(1, count + 1)
     ]
     return tuple(sorted(patches, key=lambda patch: -patch.area_m2))
+
+
+def widened(model: BodyModel, sigma_m: Array, patches: Sequence[Patch]) -> Array:
+    """Standard deviations (P,) of a surface, with what its unmatched patches add around them: there
+    the skin is as far off as the patch."""
+    found = sigma_m.copy()
+    for patch in patches:
+        if patch.area_m2 < _LEAST_WIDENED_M2 or patch.distance_m > ELSEWHERE_M:
+            continue
+        around = np.zeros(len(sigma_m))
+        around[patch.vertices] = 1.0
+        for _ in range(_WIDENED_RINGS):
+            around += model.adjacency @ around
+        near = around > 0.0
+        found[near] = np.hypot(found[near], patch.distance_m)
+    return found
 
 
 def _parts_of(part: NDArray[np.int32]) -> tuple[int, ...]:

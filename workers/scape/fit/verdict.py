@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
-from workers.scape.fit.unmatched import Patch
+from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
 
@@ -18,13 +18,14 @@ Array = NDArray[np.float64]
 
 _LEAST_COVERAGE = 0.22
 """Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
+_ONE_SIDED_COVERAGE = 0.6
+"""Coverage below which a part cannot be measured when a whole side of the person is missing: of one
+side alone cameras see up to a half."""
 _LEAST_EXTREMITY_COVERAGE = 0.10
 """The same for hands, feet, shoulders and the neck, which hide behind other parts."""
 _LOST_PATCH_M2 = 0.0040
 """Least area of a patch of the scan farther than 15 mm from the surface that makes a scan unusable:
 lost limbs leave 66 to 205 cm^2, folds and hair of sound scans of real people up to 11 cm^2."""
-_ELSEWHERE_M = 0.15
-"""Distance of a patch from which it is no limb of the person but something else."""
 _PARTS_NAMED = 6
 """Parts that the reasons name at most."""
 _UNEXPLAINED_M = 0.03
@@ -41,8 +42,8 @@ _JUDGED_COMPONENTS = 10
 _POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
 """Points used for the report on parts, and for the comparison of starts."""
 _TRUNK = ("pelvis", "abdomen", "chest")
-_SIDES = {"front": -1.0, "back": 1.0}
-"""Signs of y: the template faces -y."""
+_SIDES = {"front": (1, -1.0), "back": (1, 1.0), "left side": (0, 1.0), "right side": (0, -1.0)}
+"""Axes and signs: the template faces -y."""
 _FACING = 0.7
 """Least y component of the normals of a side."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
@@ -114,7 +115,7 @@ def report_parts(
 
 
 def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
-    """Shares of the trunk's front and back that cameras saw.
+    """Shares of the trunk's front, back, left and right that cameras saw.
 
     Coverage by part does not show that one side is missing: half of each part is then still seen.
     """
@@ -122,8 +123,10 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     toward = vertex_normals(model.mean, model.faces)[:, 1]
     trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
     shares = {}
-    for side, sign in _SIDES.items():
-        there = trunk & (sign * toward > _FACING)
+    for side, (axis, sign) in _SIDES.items():
+        # Flanks are seen by none of four cameras: a left is the left half of front and back.
+        facing = sign * toward > _FACING if axis == 1 else sign * model.mean[:, 0] > 0.0
+        there = trunk & facing
         shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
     return shares
 
@@ -164,7 +167,7 @@ def judge(
     """Decide whether to scan again.
 
     Args:
-        sides: shares of the trunk's front and back that were seen.
+        sides: what `sides_seen` gives.
         findings: what preprocessing noticed; each is a reason.
         lost: what `lost_parts` gives.
         beta: (B,), shape coefficients.
@@ -180,14 +183,16 @@ def judge(
         )
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MOST_BETA:
         reasons.append("what stands in the booth does not look like a person")
+    one_sided = False
     for side, share in sides.items():
         if share < _LEAST_COVERAGE:
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
+            one_sided = True
     missing = [name for name in lost if name]
     for part in parts:
         found = _part_reasons(part)
         reasons += found
-        if found:
+        if found or (one_sided and part.coverage < _ONE_SIDED_COVERAGE):
             missing.append(part.name)
     noticed, unusable = _CAMERA_SHIFTS_M
     notes: list[str] = []
@@ -197,7 +202,9 @@ def judge(
                 f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
                 "run: station check"
             )
-    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(missing))
+    return Verdict(
+        "rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(dict.fromkeys(missing))
+    )
 
 
 def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
@@ -208,7 +215,7 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
         if patch.area_m2 < _LOST_PATCH_M2:
             continue
         size = f"{1e4 * patch.area_m2:.0f} cm2"
-        if patch.distance_m > _ELSEWHERE_M:
+        if patch.distance_m > ELSEWHERE_M:
             reasons.setdefault(
                 "",
                 f"{size} of the scan do not belong to the person: "
