@@ -12,9 +12,10 @@ import pytest
 
 from station.core.bundle import read_bundle
 from station.core.geometry import so3_exp
-from workers.cloud.cloud_file import _consistent, read_cloud
+from workers.cloud.cloud_file import _outwards, read_cloud
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
+from workers.measure.body import measure_body
 from workers.scape.fit.fit import FitResult, fit_body
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
@@ -120,9 +121,8 @@ def test_a_person_may_face_any_way(model: BodyModel, bundle: Path, turn_deg: flo
 def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     model: BodyModel, bundle: Path, tmp_path: Path
 ) -> None:
-    """Front and back cameras see two sheets; which side of them is out only their distance says.
-
-    Hands and feet are left out: the two sheets of a foot lie too near each other for that.
+    """Front and back cameras see two sheets; which of their sides is out only their distance says,
+    and below a foot the floor.
     """
     seen = preprocess(read_bundle(bundle)).cloud
     bare = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen.points))
@@ -130,13 +130,35 @@ def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     cloud = read_cloud(tmp_path / "bare.ply", "z")
     assert np.mean(np.einsum("ni,ni->n", cloud.normals, seen.normals) > 0.0) > 0.95
     ahead = np.where(seen.normals[:, 1] < 0.0, 1.0, -1.0)[:, None]
-    outwards = _consistent(seen.points, ahead * seen.normals)
+    outwards = _outwards(seen.points, ahead * seen.normals)
     assert np.mean(np.einsum("ni,ni->n", outwards, seen.normals) > 0.0) > 0.95
     fit = fit_body(model, Preprocessed(cloud, (), ()))
     truth = np.load(BODIES / "ben.npz")["vertices"] - cloud.origin_m
-    away = _distance_to(fit.vertices, model.faces, truth)[~_extremities(model)]
-    assert np.sqrt(np.mean(away**2)) < 0.004
+    away = _distance_to(fit.vertices, model.faces, truth)
+    assert np.sqrt(np.mean(away**2)) < 0.003
+    for side in ("left", "right"):
+        foot = model.part_of_vertex == model.part_names.index(f"foot_{side}")
+        assert np.sqrt(np.mean(away[foot] ** 2)) < 0.004
     assert fit.verdict.status == "ok"
+
+
+@pytest.mark.parametrize("side", ["back", "left"])
+def test_half_a_body_has_no_rows_that_look_sound(model: BodyModel, bundle: Path, side: str) -> None:
+    """Rows that need the other half are blank, and a scan again is asked."""
+    seen = preprocess(read_bundle(bundle)).cloud
+    front = np.char.startswith(np.array(seen.camera_names), "front")[seen.camera]
+    kept = front if side == "back" else seen.points[:, 0] < 0.0
+    chosen = {
+        name: getattr(seen, name)[kept] for name in ("points", "normals", "sigma_m", "camera")
+    }
+    fit = fit_body(model, Preprocessed(replace(seen, **chosen), (), ()))
+    assert fit.verdict.status == "rescan"
+    assert side in " ".join(fit.verdict.reasons)
+    missing = fit.verdict.missing_parts
+    rows = measure_body(model, fit.overlapping, fit.vertex_sigma_m, fit.vertex_seen).rows
+    girths = [row for row in rows if row.name.endswith(("waist_girth", "hip_girth", "chest_girth"))]
+    assert len(girths) >= 3
+    assert all(row.parts & missing for row in girths)
 
 
 def test_the_paper_method_gives_a_body_too(model: BodyModel, bundle: Path) -> None:

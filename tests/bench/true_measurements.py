@@ -1,7 +1,7 @@
 """Measures a true body for the benchmark, sharing with the product's measuring only the written
 definitions: the table of rows, the landmarks' vertices, the parts' names.
 
-Everything is done another kind. A plane cuts whole triangles into segments; a tape around them is
+Everything is done another way. A plane cuts whole triangles into segments; a tape around them is
 as long as the mean of the section's widths over all directions times pi (Cauchy's formula for
 convex curves); a tape over the skin follows the envelope of the section above its chord.
 """
@@ -168,7 +168,7 @@ class TrueBody:
         line = np.concatenate([[[0.0, 0.0]], line, [[length, 0.0]]])
         if not taut:
             return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-        # A taut tape: the shortest kind that stays above, by relaxing towards the chord from above.
+        # A taut tape: the shortest path that stays above, by relaxing towards the chord from above.
         angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
         line[:, 1] = np.maximum(line[:, 1], 0.0)
         reach = np.outer(line[:, 0], np.cos(angle)) + np.outer(line[:, 1], np.sin(angle))

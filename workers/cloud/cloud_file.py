@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
@@ -31,10 +32,14 @@ _WIDENING, _SPACING_M = 0.25, 0.01
 sampled."""
 _NEARNESS_M = 0.15
 """Decay of a point's weight with its depth: farther away there may be another limb."""
-_VOTERS, _ROUNDS = 30, 8
-"""Neighbours that vote on a normal's sign, and how often."""
-_AGREED = 0.8
-"""Share of equal signs from which the propagated orientation is kept."""
+_FOOT_M = 0.12
+"""Height of a foot."""
+_LINKS, _SPREAD_ROUNDS = 8, 150
+"""Neighbours that evidence is shared with, and how often: points are 5 to 8 mm apart, so that it
+comes 10 cm far."""
+_SAME_SKIN = 0.6
+"""Largest sine of the slope from a point to a neighbour on the same skin, and the least cosine of
+their normals."""
 _SIGMA_M = 0.001
 """Standard deviation that is assumed for the points of a file."""
 _UNSEEN_SOLES_M = 0.03
@@ -149,46 +154,64 @@ def _estimate_normals(cloud: o3d.geometry.PointCloud, path: Path) -> None:
     nearest = cKDTree(np.asarray(some.points)).query(points, workers=-1)[1]
     agrees = np.einsum("ni,ni->n", np.asarray(some.normals)[nearest], normals) >= 0.0
     oriented = np.where(agrees[:, None], normals, -normals)
-    cloud.normals = o3d.utility.Vector3dVector(_consistent(points, oriented))
+    cloud.normals = o3d.utility.Vector3dVector(_outwards(points, oriented))
 
 
-def _consistent(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) that all point out of a body or all into it.
+def _outwards(points: Array, normals: Array) -> Array:
+    """Normals (n, 3) of a body's points (n, 3), each oriented outwards by what lies behind the skin
+    around it.
 
-    The given normals agree with their neighbours. Across the gaps between two scanners' views that
-    agreement is lost, and one side may point inwards. In that case each normal is oriented by what
-    lies behind it.
-    """
-    turned = _turned_outwards(points, normals)
-    share = float(np.mean(np.einsum("ni,ni->n", turned, normals) > 0.0))
-    return turned if 1.0 - _AGREED < share < _AGREED else normals
-
-
-def _turned_outwards(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) of a body's points (n, 3), each oriented outwards.
-
-    The body's other side lies behind the skin; in front of it there is nothing, or another limb
-    farther away. Neighbours vote on the sign. This fails between limbs and on hands.
+    Neighbours agree in sign mostly; across the gaps between two scanners' views and at the rims of
+    feet that agreement is lost, and a piece of the skin may point inwards.
     """
     chosen = slice(None, None, max(1, len(points) // _ORIENTED))
-    oriented, directions = points[chosen], normals[chosen]
-    others = cKDTree(points[:: max(1, len(points) // _OPPOSITE)])
-    outside = np.zeros(len(oriented))
+    places, directions = points[chosen], normals[chosen]
+    tree = cKDTree(places)
+    evidence = _spread(tree, directions, _evidence(points, places, directions))
+    mine = np.where(evidence < 0.0, -1.0, 1.0)[:, None] * directions
+    mine = mine[tree.query(points, workers=-1)[1]]
+    agrees = np.einsum("ni,ni->n", mine, normals) >= 0.0
+    return np.where(agrees[:, None], normals, -normals)
+
+
+def _spread(tree: cKDTree, directions: Array, evidence: Array) -> Array:
+    """Evidence (n,) of a tree's points, spread along the skin: neighbours whose directions are
+    alike share it, and where they are opposite it changes its sign.
+    """
+    neighbours = tree.query(tree.data, _LINKS + 1, workers=-1)[1][:, 1:]
+    offsets = tree.data[neighbours] - tree.data[:, None]
+    across = np.abs(np.einsum("ni,nki->nk", directions, offsets))
+    cosine = np.einsum("ni,nki->nk", directions, directions[neighbours])
+    # Skin that touches other skin lies along the normal from it.
+    one_skin = across < _SAME_SKIN * np.linalg.norm(offsets, axis=2)
+    link = np.where(one_skin & (np.abs(cosine) > _SAME_SKIN), cosine, 0.0)
+    tail = np.repeat(np.arange(tree.n), _LINKS)
+    graph = csr_matrix((link.ravel() / _LINKS, (tail, neighbours.ravel())), shape=(tree.n, tree.n))
+    found = evidence
+    for _ in range(_SPREAD_ROUNDS):
+        found = evidence + graph @ found
+    return np.asarray(found)
+
+
+def _evidence(points: Array, places: Array, directions: Array) -> Array:
+    """Evidence (n,) that directions (n, 3) at places (n, 3) of a cloud point out of the body;
+    negative where they point into it.
+
+    The body's other side lies behind the skin, and below a foot the floor; in front of it there is
+    nothing, or another limb farther away. This fails between limbs and on hands.
+    """
+    low_m = float(points[:, 2].min())
+    standing = points[points[:, 2] < low_m + _FOOT_M] * (1.0, 1.0, 0.0) + (0.0, 0.0, low_m)
+    every = max(1, len(points) // _OPPOSITE)
+    others = cKDTree(np.concatenate([points[::every], standing[::every]]))
+    found = np.zeros(len(places))
     for depth_m in _DEPTHS_M:
         gap_m = _WIDENING * depth_m + _SPACING_M
         for side in (1.0, -1.0):
-            place = oriented + side * depth_m * directions
-            away = others.query(place, distance_upper_bound=gap_m, workers=-1)[0]
-            outside -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
-    tree = cKDTree(oriented)
-    voters = tree.query(oriented, _VOTERS, workers=-1)[1]
-    outwards = np.sign(outside)[:, None] * directions
-    for _ in range(_ROUNDS):
-        agreed = np.einsum("ni,ni->n", outwards[voters].sum(axis=1), directions) >= 0.0
-        outwards = np.where(agreed[:, None], directions, -directions)
-    mine = outwards[tree.query(points, workers=-1)[1]]
-    agrees = np.einsum("ni,ni->n", mine, normals) >= 0.0
-    return np.where(agrees[:, None], normals, -normals)
+            there = places + side * depth_m * directions
+            away = others.query(there, distance_upper_bound=gap_m, workers=-1)[0]
+            found -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
+    return found
 
 
 def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:

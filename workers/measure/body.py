@@ -149,7 +149,7 @@ def _basis(skin: SeenSkin | None, trace: Trace, scan_errors: ScanErrors) -> Basi
     """
     if skin is None:
         return "seen"
-    if isinstance(trace.definition.way, Top):
+    if isinstance(trace.definition.kind, Top):
         return "inferred" if scan_errors.crown_sigma_m > 0.0 else "seen"
     return skin.basis(trace)
 

@@ -18,9 +18,10 @@ Array = NDArray[np.float64]
 
 _LEAST_COVERAGE = 0.22
 """Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
-_ONE_SIDED_COVERAGE = 0.6
-"""Coverage below which a part cannot be measured when a whole side of the person is missing: of one
-side alone cameras see up to a half."""
+_HALF_COVERAGE = 0.6
+"""Coverage below which a part cannot be measured when half the person is missing: of one half alone
+cameras see up to a half of it."""
+_LIMBS = ("left", "right")
 _LEAST_EXTREMITY_COVERAGE = 0.10
 """The same for hands, feet, shoulders and the neck, which hide behind other parts."""
 _LOST_PATCH_M2 = 0.0040
@@ -42,8 +43,8 @@ _JUDGED_COMPONENTS = 10
 _POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
 """Points used for the report on parts, and for the comparison of starts."""
 _TRUNK = ("pelvis", "abdomen", "chest")
-_SIDES = {"front": (1, -1.0), "back": (1, 1.0), "left side": (0, 1.0), "right side": (0, -1.0)}
-"""Axes and signs: the template faces -y."""
+_SIDES = {"front": -1.0, "back": 1.0}
+"""Signs of y: the template faces -y."""
 _FACING = 0.7
 """Least y component of the normals of a side."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
@@ -115,7 +116,7 @@ def report_parts(
 
 
 def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
-    """Shares of the trunk's front, back, left and right that cameras saw.
+    """Shares of the trunk's front and back that cameras saw.
 
     Coverage by part does not show that one side is missing: half of each part is then still seen.
     """
@@ -123,10 +124,8 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     toward = vertex_normals(model.mean, model.faces)[:, 1]
     trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
     shares = {}
-    for side, (axis, sign) in _SIDES.items():
-        # Flanks are seen by none of four cameras: a left is the left half of front and back.
-        facing = sign * toward > _FACING if axis == 1 else sign * model.mean[:, 0] > 0.0
-        there = trunk & facing
+    for side, sign in _SIDES.items():
+        there = trunk & (sign * toward > _FACING)
         shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
     return shares
 
@@ -183,17 +182,22 @@ def judge(
         )
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MOST_BETA:
         reasons.append("what stands in the booth does not look like a person")
-    one_sided = False
+    halved = False
     for side, share in sides.items():
         if share < _LEAST_COVERAGE:
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
-            one_sided = True
+            halved = True
     missing = [name for name in lost if name]
     for part in parts:
         found = _part_reasons(part)
         reasons += found
-        if found or (one_sided and part.coverage < _ONE_SIDED_COVERAGE):
+        if found:
             missing.append(part.name)
+    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= set(missing) for side in _LIMBS)
+    if halved:
+        missing += [
+            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
+        ]
     noticed, unusable = _CAMERA_SHIFTS_M
     notes: list[str] = []
     for camera, shift in camera_shifts_m.items():
