@@ -24,6 +24,7 @@ from workers.measure.standing import on_both_feet, standard_turns
 from workers.scape.learn.database import PARTS, Shapes, body_database
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, vertex_normals
+from workers.scape.surface.intersections import self_intersections
 
 Array = NDArray[np.float64]
 UnlikeSplit = Literal["development", "test"]
@@ -31,8 +32,12 @@ UnlikeSplit = Literal["development", "test"]
 _SEEDS: dict[UnlikeSplit, int] = {"development": 61, "test": 62}
 POOL = 40
 """Bodies of a split that are drawn, however many of them are used."""
+_DRAWN = 16
+"""Bodies that are drawn at a time: fewer take the database as long."""
 _POSE_SHARE = 0.7
 """People who are shown how to stand vary less than the poses that the model was learned from."""
+_TOUCHING = 80
+"""Crossings of the finer triangles that armpits and toes have in any pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +69,13 @@ class UnlikeBodies:
     def body(self, index: int) -> UnlikeBody:
         """One body (0 to POOL - 1), its middle above the origin, on the floor, facing -y."""
         if index >= len(self._shapes):
-            self._shapes = self._database.sample("test", index + 1, _SEEDS[self._split])
+            drawn = _DRAWN * (index // _DRAWN + 1)
+            self._shapes = self._database.sample("test", drawn, _SEEDS[self._split])
         shapes = self._shapes.take(np.array([index]))
-        poses = np.stack([np.zeros_like(self._standing), self._poses[index], self._standing])
-        one = shapes.take(np.zeros(len(poses), np.intp))
-        neutral, posed, standing = (
-            self._subdivision @ body for body in self._database.vertices(one, poses)
-        )
+        neutral, standing = self._finer(shapes, np.zeros_like(self._standing), self._standing)
         female = bool(shapes.phenotypes["gender"][0] > 0.5)
         moved = self._sculpted(neutral, index, female=female)
-        posed = posed + carried(moved, neutral, posed, self.faces)
+        posed = self._with_room(shapes, neutral, moved, index)
         middle = 0.5 * (posed.min(axis=0) + posed.max(axis=0))
         posed -= (middle[0], middle[1], posed[:, 2].min())
         standing = standing + carried(moved, neutral, standing, self.faces)
@@ -85,6 +87,22 @@ class UnlikeBodies:
         }
         name = f"unlike {self._split} {index:02d}"
         return UnlikeBody(name, Mesh(posed, self.faces), truth)
+
+    def _finer(self, shapes: Shapes, *poses: Array) -> list[Array]:
+        """One body in some poses, subdivided."""
+        one = shapes.take(np.zeros(len(poses), np.intp))
+        return [self._subdivision @ body for body in self._database.vertices(one, np.stack(poses))]
+
+    def _with_room(self, shapes: Shapes, neutral: Array, moved: Array, index: int) -> Array:
+        """The sculpted body in the first pose, from its own on, in which no limb is in its trunk or
+        in another limb: no person stands like that."""
+        most = self_intersections(neutral + moved, self.faces) + _TOUCHING
+        for pose in np.roll(self._poses, -index, axis=0):
+            posed = self._finer(shapes, pose)[0]
+            posed = posed + carried(moved, neutral, posed, self.faces)
+            if self_intersections(posed, self.faces) <= most:
+                return posed
+        raise RuntimeError("every pose has a limb in the body")
 
     def _sculpted(self, neutral: Array, index: int, *, female: bool) -> Array:
         landmarks = self._model.landmarks

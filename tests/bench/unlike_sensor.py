@@ -37,7 +37,7 @@ class UnlikeSensor:
     """Errors of the sensors and of the calibration."""
 
     bias_m: float = 1.5e-3
-    """Root mean square of each sensor's bias, at 1.7 m."""
+    """Size of each sensor's bias at 1.7 m: 95 of 100 pixels err by less."""
     bias_wavelengths_px: tuple[float, float] = (100.0, 400.0)
     eroded_px: tuple[int, int] = (1, 2)
     """Fewest and most pixels that a silhouette loses, one number for each camera."""
@@ -110,7 +110,7 @@ def _bias_map(height: int, width: int, sensor: UnlikeSensor, rng: np.random.Gene
         step = 2.0 * np.pi / length
         total += np.cos(step * (np.cos(angle) * x + np.sin(angle) * y) + phase)
     total -= total.mean()
-    return np.asarray(sensor.bias_m * total / total.std())
+    return np.asarray(sensor.bias_m * total / np.quantile(np.abs(total), 0.95))
 
 
 def _misread(depth: NDArray[np.uint16], bias_m: Array, radius: int) -> NDArray[np.uint16]:
