@@ -6,7 +6,7 @@ DEMO := demo
 # Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
 # share, and files begin in their order, the long ones of tests/accuracy first.
 PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
-BENCHES := bench-capture bench-console bench-fit bench-measure bench-calibration bench-drift
+BENCHES := bench-capture bench-console bench-fit bench-measure bench-calibration bench-violations bench-drift
 
 .PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
@@ -88,7 +88,7 @@ lock: $(VENV)/dev.stamp
 # The benchmarks of fit and measurements render held-out bodies, which needs
 # the training extra.
 bench-fit bench-measure: $(VENV)/train.stamp
-bench-capture bench-calibration bench-drift: $(VENV)/dev.stamp
+bench-capture bench-calibration bench-violations bench-drift: $(VENV)/dev.stamp
 bench-console: $(VENV)/dev.stamp $(VENV)/chromium.stamp
 bench-console: export PYTHONPATH = tests
 $(BENCHES): bench-%:

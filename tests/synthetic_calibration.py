@@ -6,28 +6,35 @@ with the sensor's noise; no arm, no false detections. For tests of the solution 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.equations import center_equations, recentred
+from station.calibration.adjust.problem import Sightings
+from station.calibration.adjust.sensor_model import COARSE, image_place
 from station.calibration.detect.ball_image import ball_inverse_depth
 from station.calibration.detect.detections import (
+    AROUND,
+    BALL,
     FLOOR,
+    FRONT,
+    MARK,
+    STAND,
     BallDetection,
     Observations,
     PlaneObservation,
 )
-from station.calibration.solve import depth_correction
-from station.calibration.solve.depth_correction import MIDDLE, correction_of
-from station.calibration.solve.joint import local_equations
-from station.calibration.solve.problem import Sightings
+from station.calibration.detect.planes import mean_share
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import ROUNDING, SQUARE_ERROR
+from station.core.lens import pixel_rays, project
 from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.simulation import violations
 from station.simulation.noise import UnitError
-from station.simulation.procedure import AROUND, BALL, VirtualProcedure
+from station.simulation.procedure import VirtualProcedure
 from station.simulation.scene import default_rig
 from station.simulation.sensor import SimulatedBooth, SimulatedUnit
 
@@ -36,8 +43,11 @@ Array = NDArray[np.float64]
 _CELL_PX = 9
 
 
-def booth(seed: int, bias_m: float = 0.015) -> SimulatedBooth:
-    """A booth that somebody has put up by eye: no two are alike."""
+def booth(seed: int, bias_m: float = 0.015, switches: Iterable[str] = ()) -> SimulatedBooth:
+    """A booth that somebody has put up by eye: no two are alike.
+
+    ``switches``: names of `station.simulation.violations`.
+    """
     rng = np.random.default_rng((seed, 77))
     rig = default_rig()
     cameras = {
@@ -50,7 +60,12 @@ def booth(seed: int, bias_m: float = 0.015) -> SimulatedBooth:
     }
     rig = replace(rig, cameras=cameras)
     return SimulatedBooth(
-        rig=rig, seed=seed, bias_m=bias_m, uneven_floor_m=5e-4, uneven_board_m=2e-4
+        rig=rig,
+        seed=seed,
+        bias_m=bias_m,
+        violations=frozenset(switches),
+        uneven_floor_m=5e-4,
+        uneven_board_m=2e-4,
     )
 
 
@@ -66,37 +81,43 @@ def true_correction(error: UnitError) -> DepthCorrection:
     shift = 0.25 * error.bias_m
     tilt_x, tilt_y = error.tilt
     parameters = (shift, error.gain, error.curvature, shift * tilt_x, shift * tilt_y)
-    return correction_of(np.array(parameters))
+    return COARSE.correction(np.array(parameters))
 
 
 def observations(
-    procedure: VirtualProcedure, *, rate_hz: float = 10.0, clock_error_s: float = 0.0
+    procedure: VirtualProcedure,
+    *,
+    rate_hz: float = 10.0,
+    clock_error_s: float = 0.0,
+    boards: bool = False,
+    stands: bool = False,
 ) -> Observations:
-    """A whole calibration's detections."""
+    """A whole calibration's detections; with boards and the ball on its stand where wanted."""
     waved: list[BallDetection] = []
-    mark: list[BallDetection] = []
-    front: list[BallDetection] = []
-    planes = []
-    beside = [(f"{AROUND}-{i}", at) for i, at in enumerate(procedure.around_m)]
-    around: dict[str, list[BallDetection]] = {step: [] for step, _ in beside}
+    planes: list[PlaneObservation | None] = []
+    steps = [MARK, FRONT, *(step for step in procedure.steps if step.startswith(AROUND))]
+    steps += [step for step in procedure.steps if stands and step.startswith(STAND)]
+    resting: dict[str, list[BallDetection]] = {step: [] for step in steps}
     start_s = procedure.starts_s(BALL)
-    low = np.array([0.0, 0.0, procedure.radius_m])
-    for index, (name, camera) in enumerate(procedure.booth.rig.cameras.items()):
+    for index, name in enumerate(procedure.booth.rig.cameras):
         rng = np.random.default_rng((procedure.booth.seed, index, 9))
         unit = SimulatedUnit.of(procedure.booth, name)
         late_s = clock_error_s * rng.standard_normal()
         for time_s in np.arange(start_s + unit.phase_s, start_s + procedure.waving_s, 1 / rate_hz):
-            seen = _ball(camera, unit, procedure.ball_center_m(time_s), procedure, rng)
+            center_m, axis = procedure.ball_center_m(time_s), procedure.axis(BALL, time_s)
+            seen = _ball(unit, center_m, axis, procedure, rng)
             if seen is not None:
                 waved.append(replace(seen, time_s=float(time_s + late_s)))
-        places = [(low, mark), (low - (0.0, procedure.front_m, 0.0), front)]
-        places += [(np.array([x, y, low[2]]), around[step]) for step, (x, y) in beside]
-        for place, found in places:
-            looks = [_ball(camera, unit, place, procedure, rng) for _ in range(15)]
+        for step, found in resting.items():
+            center_m, axis = procedure.resting_m(step), procedure.axis(step, 0.0)
+            looks = [_ball(unit, center_m, axis, procedure, rng) for _ in range(15)]
             found += [detection for detection in looks if detection is not None]
-        planes.append(_floor(camera, unit, rng))
+        planes.append(_floor(unit, procedure.booth, rng))
+        for place, y in enumerate(procedure.board_at_m if boards else ()):
+            planes.append(_board(unit, f"wall-{place}", y, rng))
+    mark, front = resting.pop(MARK), resting.pop(FRONT)
     return Observations(
-        waved, mark, front, [plane for plane in planes if plane is not None], around
+        waved, mark, front, [plane for plane in planes if plane is not None], resting
     )
 
 
@@ -108,85 +129,128 @@ def detections(
     found = []
     for name in cameras:
         unit = SimulatedUnit.of(procedure.booth, name)
-        seen = _ball(procedure.booth.rig.cameras[name], unit, center_m, procedure, rng)
+        seen = _ball(unit, center_m, procedure.axis(BALL, time_s), procedure, rng)
         if seen is not None:
             found.append(replace(seen, time_s=time_s))
     return found
 
 
-def _measured(
-    unit: SimulatedUnit, camera: CameraCalibration, u: Array, v: Array, w: Array
-) -> Array:
-    """Inverse depths as the unit reports them, its error written down once more."""
-    error = unit.error
-    x, y = 2.0 * u / (camera.width - 1) - 1.0, 2.0 * v / (camera.height - 1) - 1.0
-    tilted = 1.0 + error.tilt[0] * x + error.tilt[1] * y
-    shift = 0.25 * error.bias_m * tilted
-    return np.asarray(w - shift - error.gain * w - error.curvature * (w - MIDDLE) ** 2)
+def reported(unit: SimulatedUnit, pixels: Array, depth_m: Array) -> Array:
+    """Depths (...) that the station reads of true depths at pixels (..., 2), without noise."""
+    x, y = np.moveaxis(image_place(unit.camera, pixels), -1, 0)
+    return np.asarray(unit.error.decoded_m(depth_m + unit.error.offset_m(x, y, depth_m)))
+
+
+def _noise(unit: SimulatedUnit, variance: Array, frames: int, rng: np.random.Generator) -> Array:
+    """Noise of means over frames, of which a part is the same in all of them."""
+    share = unit.error.frozen_share
+    sigma = np.sqrt(variance * (share + (1.0 - share) / frames))
+    return np.asarray(rng.normal(0.0, sigma))
 
 
 def _ball(
-    camera: CameraCalibration,
     unit: SimulatedUnit,
     center_m: Array,
+    axis: Array,
     procedure: VirtualProcedure,
     rng: np.random.Generator,
 ) -> BallDetection | None:
-    center = transform(invert(camera.world_from_camera), center_m)
+    lens, believed = unit.camera, procedure.booth.rig.cameras[unit.camera.name]
+    camera_from_world = invert(lens.world_from_camera)
+    center = transform(camera_from_world, center_m)
     if center[2] < 0.6:
         return None
-    K, radius = camera.K, procedure.radius_m
-    middle = (K @ (center / center[2]))[:2]
-    reach = 0.88 * radius * K[0, 0] / center[2]
-    size = (camera.width, camera.height)
-    if (middle < reach / 2).any() or (middle > np.array(size) - reach / 2).any():
+    radius, stated = procedure.true_radius_m, procedure.radius_m
+    middle = project(lens, center)
+    reach = 0.88 * radius * lens.K[0, 0] / center[2]
+    size = np.array([lens.width, lens.height])
+    if (middle < reach / 2).any() or (middle > size - reach / 2).any():
         return None
     grid = np.rint(np.arange(-reach, reach + 1, _CELL_PX))
-    u, v = (middle[:, None, None] + np.array(np.meshgrid(grid, grid))).reshape(2, -1)
-    u, v = np.rint(u), np.rint(v)
-    inside = (np.hypot(u - middle[0], v - middle[1]) < reach) & (u >= 0) & (v >= 0)
-    inside &= (u < camera.width) & (v < camera.height)
-    u, v = u[inside], v[inside]
-    ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+    pixels = np.rint(middle + np.array(np.meshgrid(grid, grid)).reshape(2, -1).T)
+    inside = np.linalg.norm(pixels - middle, axis=1) < reach
+    inside &= ((pixels >= 0) & (pixels < size)).all(axis=1)
+    pixels = pixels[inside]
+    ray = pixel_rays(lens, pixels)
     w = ball_inverse_depth(center[None], ray[None], radius)[0][0]
-    outward = (np.append(ray, np.ones((len(u), 1)), axis=1) / w[:, None] - center) / radius
-    towards = np.append(ray, np.ones((len(u), 1)), axis=1)
-    cosine = np.abs(np.sum(outward * towards, axis=1)) / np.linalg.norm(towards, axis=1)
+    towards = np.append(ray, np.ones((len(ray), 1)), axis=1)
+    outward = (towards / w[:, None] - center) / radius
+    length = np.linalg.norm(towards, axis=1)
+    cosine = np.abs(np.sum(outward * towards, axis=1)) / length
+    higher_m = radius * procedure.oval_share * (outward @ camera_from_world[:3, :3] @ axis) ** 2
+    depth = 1.0 / w - higher_m / cosine / length
     variance = (SQUARE_ERROR / cosine + ROUNDING) / _CELL_PX**2
-    measured = _measured(unit, camera, u, v, w) + rng.normal(0.0, np.sqrt(variance))
-    patches = np.stack([u, v, measured, variance], axis=1)
+    measured = 1.0 / reported(unit, pixels, depth) + rng.normal(0.0, np.sqrt(variance))
+    patches = np.column_stack([pixels, measured, variance])
     seen = BallDetection(
-        camera.name, 0.0, center, np.eye(3), len(u) * _CELL_PX**2, radius, 2e-3, patches
+        lens.name, 0.0, center, np.eye(3), len(pixels) * _CELL_PX**2, stated, 2e-3, patches
     )
-    for _ in range(3):
-        sightings = Sightings.of(camera, [seen])
-        correction = np.zeros(depth_correction.PARAMETERS)
-        normal, pull = local_equations(sightings, seen.center_m[None], correction, radius)
-        covariance: Array = np.linalg.inv(normal[0, :3, :3]).astype(np.float64)
-        seen = replace(
-            seen, center_m=seen.center_m - covariance @ pull[0, :3], covariance_m2=covariance
-        )
-    return seen
+    sightings = Sightings.of(believed, [seen])
+    nothing = np.zeros(COARSE.size)
+    detected = recentred(sightings, believed, COARSE, nothing, stated)
+    matrix, _ = center_equations(sightings, believed, COARSE, detected, nothing, stated)
+    return replace(
+        seen, center_m=detected[0], covariance_m2=np.linalg.inv(matrix[0, :3, :3]).astype(float)
+    )
+
+
+def _cells() -> Array:
+    """Middles (n, 2) of cells of 12 x 12 pixels."""
+    v, u = (axis.ravel().astype(float) for axis in np.mgrid[6:480:12, 6:640:12])
+    return np.stack([u, v], axis=1)
 
 
 def _floor(
-    camera: CameraCalibration, unit: SimulatedUnit, rng: np.random.Generator
+    unit: SimulatedUnit, booth: SimulatedBooth, rng: np.random.Generator
 ) -> PlaneObservation | None:
-    v, u = (axis.ravel().astype(float) for axis in np.mgrid[6:480:12, 6:640:12])
-    K = camera.K
-    ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=1)
-    down = -(ray @ camera.world_from_camera[2, :3])
-    w = down / camera.world_from_camera[2, 3]
-    cosine = down / np.linalg.norm(ray, axis=1)
-    seen = (cosine > 0.3) & (w > 0.3)
+    pose, pixels = unit.camera.world_from_camera, _cells()
+    towards = np.append(pixel_rays(unit.camera, pixels), np.ones((len(pixels), 1)), axis=1)
+    turned = towards @ pose[:3, :3].T
+    down = -turned[:, 2]
+    cosine = down / np.linalg.norm(towards, axis=1)
+    seen = (cosine > 0.3) & (down > 0.3 * pose[2, 3])
     if seen.sum() < 40:
         return None
-    u, v, w = u[seen], v[seen], w[seen]
-    variance = (SQUARE_ERROR / cosine[seen] + ROUNDING) / (12**2 * 30) + (5e-4 * w**2) ** 2
-    measured = _measured(unit, camera, u, v, w) + rng.normal(0.0, np.sqrt(variance))
-    return PlaneObservation(
-        camera.name, FLOOR, 12**2 * len(u), np.stack([u, v, measured, variance], axis=1)
-    )
+    pixels, turned, down, cosine = pixels[seen], turned[seen], down[seen], cosine[seen]
+    depth = pose[2, 3] / down
+    for _ in range(3):
+        x, y = (pose[:2, 3] + depth[:, None] * turned[:, :2]).T
+        depth = (pose[2, 3] - violations.bow_m(booth.violations, booth.seed, x, y)) / down
+    return _plane(unit, FLOOR, pixels, depth, cosine, 5e-4, rng)
+
+
+def _board(
+    unit: SimulatedUnit, surface: str, y_m: float, rng: np.random.Generator
+) -> PlaneObservation | None:
+    pose, pixels = unit.camera.world_from_camera, _cells()
+    towards = np.append(pixel_rays(unit.camera, pixels), np.ones((len(pixels), 1)), axis=1)
+    turned = towards @ pose[:3, :3].T
+    side_m = y_m + 0.01 * np.sign(pose[1, 3] - y_m)
+    depth = (side_m - pose[1, 3]) / turned[:, 1]
+    at = pose[:3, 3] + depth[:, None] * turned
+    seen = (np.abs(at[:, 0]) < 0.58) & (at[:, 2] > 0.03) & (at[:, 2] < 2.08) & (depth > 0.6)
+    seen &= depth < 3.2
+    if seen.sum() < 40:
+        return None
+    cosine = np.abs(turned[:, 1]) / np.linalg.norm(towards, axis=1)
+    return _plane(unit, surface, pixels[seen], depth[seen], cosine[seen], 2e-4, rng)
+
+
+def _plane(
+    unit: SimulatedUnit,
+    surface: str,
+    pixels: Array,
+    depth: Array,
+    cosine: Array,
+    uneven_m: float,
+    rng: np.random.Generator,
+) -> PlaneObservation:
+    w = 1.0 / reported(unit, pixels, depth)
+    noise = (SQUARE_ERROR / cosine + ROUNDING) / 12**2
+    uneven = (uneven_m * w**2) ** 2
+    measured = w + _noise(unit, noise, 30, rng) + rng.normal(0.0, np.sqrt(uneven))
+    patches = np.column_stack([pixels, measured, noise * mean_share(30) + uneven])
+    return PlaneObservation(unit.camera.name, surface, 12**2 * len(pixels), patches)
 
 
 @dataclass(frozen=True, slots=True)

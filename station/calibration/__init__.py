@@ -1,3 +1,3 @@
-"""Finding the cameras' places and depth errors, and noticing a camera that moved.
+"""Calibration of a booth: the cameras' poses and sensors, and the check for moved cameras.
 The calibration file itself is `station.core.rig`.
 """

@@ -87,6 +87,18 @@ class CalibrateConfig(Strict):
     waving_s: float = Field(
         default=60.0, ge=10.0, le=600.0, description="how long to wave the ball"
     )
+    height_limit_m: float = Field(
+        default=0.006,
+        gt=0.0,
+        le=0.1,
+        description="a calibration is refused whose own error of a height may exceed this (95 %)",
+    )
+    girth_limit_m: float = Field(
+        default=0.008,
+        gt=0.0,
+        le=0.1,
+        description="the same of a girth; half of either limit is remarked upon",
+    )
     countdown_s: float = Field(
         default=8.0, ge=0.0, le=60.0, description="to walk into the booth, or out of it"
     )

@@ -39,6 +39,9 @@ CORRELATED_PX = 32.0
 """Pixels that share one random error: a Gaussian window of 1.6 px has 4 pi 1.6^2."""
 SQUARE_ERROR = CORRELATED_PX * RANDOM_SIGMA**2
 """Variance of the mean of n pixels is (SQUARE_ERROR / cosine + ROUNDING) / n."""
+FROZEN_SHARE = 0.5
+"""Share of a pixel's error variance that is the same in every frame of a still scene: the speckle
+pattern of a unit does not change, only its exposure flickers."""
 ROUNDING = STEP**2 / 12.0
 """Rounding errors of neighbouring pixels are independent: the random error spans half a step."""
 INDEPENDENT_HZ = 20.0

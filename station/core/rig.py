@@ -1,4 +1,4 @@
-"""The calibration itself: every camera's lens, depth correction and place in the world.
+"""The calibration: every camera's lens, depth correction and pose in the world.
 
 Reads and writes ``calibration.json`` (format "booth-calibration", version 1).
 """
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.depth_image import DepthField
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
 
@@ -20,6 +21,8 @@ FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
 MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
+POLYNOMIAL, FIELD = "inverse-depth-poly", "inverse-depth-field"
+"""Models of depth correction, beside "none"."""
 _ROTATION_TOLERANCE = 1e-4
 
 Array = NDArray[np.float64]
@@ -29,19 +32,20 @@ Array = NDArray[np.float64]
 class DepthCorrection:
     """A camera's systematic depth error, z in metres.
 
-    1/z_true = sum_i a_i (1/z_measured)^i + g . (x, y), with x and y from -1 to 1 over the image's
-    width and height.
+    1/z_true = sum_i a_i (1/z_measured)^i + g . (x, y) + f(x, y, 1/z_measured), with x and y from
+    -1 to 1 over the image's width and height and a smooth field f.
     """
 
     coefficients: tuple[float, ...] = ()
     """(a0, a1, ...); empty = no correction."""
     image_gradient: tuple[float, float] = (0.0, 0.0)
-    """(gx, gy), 1/m: how much the error changes from the image's middle to its edges."""
+    """(gx, gy), 1/m: change of the error from the image's middle to its edges."""
+    field: DepthField | None = None
 
     def apply(self, depth_m: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Corrected depths, same shape and type; 0 (no reading) stays 0.
 
-        Where there is an image gradient, depth_m must be a whole image (h, w).
+        Where there is an image gradient or a field, depth_m must be a whole image (h, w).
         """
         if not self.coefficients:
             return depth_m
@@ -53,17 +57,66 @@ class DepthCorrection:
             gx, gy = self.image_gradient
             corrected = corrected + gx * np.linspace(-1.0, 1.0, width, dtype=np.float32)
             corrected += gy * np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+        if self.field is not None:
+            corrected = corrected + self.field.over(np.asarray(inverse, np.float32))
         # A correction extrapolated beyond its depths must not give points behind the camera.
         usable = seen & (corrected > 0)
         return np.where(usable, 1.0 / np.where(usable, corrected, 1.0), 0.0).astype(depth_m.dtype)
 
+    def inverse_at(self, inverse: Array, x: Array, y: Array) -> Array:
+        """Corrected inverse depths (n,) of measured ones at image positions x, y from -1 to 1."""
+        if not self.coefficients:
+            return inverse
+        corrected = np.polynomial.polynomial.polyval(inverse, self.coefficients)
+        corrected = corrected + self.image_gradient[0] * x + self.image_gradient[1] * y
+        if self.field is not None:
+            corrected = corrected + self.field.at(inverse, x, y)
+        return np.asarray(corrected)
+
     def to_json(self) -> dict[str, Any]:
         if not self.coefficients:
             return {"model": "none"}
-        document = {"model": "inverse-depth-poly", "coefficients": list(self.coefficients)}
+        document: dict[str, Any] = {
+            "model": POLYNOMIAL,
+            "coefficients": list(self.coefficients),
+        }
         if any(self.image_gradient):
             document["image_gradient"] = list(self.image_gradient)
+        if self.field is not None:
+            document["model"] = FIELD
+            document["inverse_depth_per_m"] = list(self.field.knots)
+            document["control_per_m"] = self.field.control.tolist()
         return document
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedError:
+    """Standard deviations of what the calibration alone adds to a scan, from its covariance."""
+
+    height_sigma_m: float
+    """Height of a person of 1.75 m."""
+    girth_sigma_m: float
+    """Girth of 1 m: the largest of those at chest, waist and hip."""
+    normal_rms_m: float
+    """The cloud along the surface's normal, rms over a standing body."""
+    tilt_sigma_rad: float
+    """The world's vertical."""
+
+    def to_json(self) -> dict[str, float]:
+        return {
+            "height_sigma_m": self.height_sigma_m,
+            "girth_sigma_m": self.girth_sigma_m,
+            "normal_rms_m": self.normal_rms_m,
+            "tilt_sigma_rad": self.tilt_sigma_rad,
+        }
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> PredictedError:
+        names = ("height_sigma_m", "girth_sigma_m", "normal_rms_m", "tilt_sigma_rad")
+        values = [float(fields[name]) for name in names]
+        if not all(np.isfinite(value) and value >= 0.0 for value in values):
+            raise ValueError("predicted must be finite and not negative")
+        return cls(*values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +161,8 @@ class Rig:
     reference: str
     cameras: Mapping[str, CameraCalibration]
     residual_rms_m: float
+    predicted: PredictedError | None = None
+    """None in files of older versions, which did not predict anything."""
 
     def camera(self, name: str, source: str = "the calibration") -> CameraCalibration:
         """A camera by name.
@@ -124,7 +179,7 @@ class Rig:
             ) from None
 
     def to_json(self) -> dict[str, Any]:
-        return {
+        document = {
             "format": FORMAT,
             "version": 1,
             "created": self.created,
@@ -132,6 +187,9 @@ class Rig:
             "cameras": {name: camera.to_json() for name, camera in self.cameras.items()},
             "residual_rms_m": self.residual_rms_m,
         }
+        if self.predicted is not None:
+            document["predicted"] = self.predicted.to_json()
+        return document
 
     def save(self, path: Path) -> None:
         """Write the calibration durably; an existing file is replaced in one step."""
@@ -157,6 +215,11 @@ class Rig:
                 reference=str(document["reference"]),
                 cameras=cameras,
                 residual_rms_m=float(document["residual_rms_m"]),
+                predicted=(
+                    PredictedError.from_json(document["predicted"])
+                    if document.get("predicted") is not None
+                    else None
+                ),
             )
         except KeyError as missing:
             raise FormatError(f"{path}: the field {missing} is missing; calibrate again") from None
@@ -218,15 +281,34 @@ def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
     model = fields.get("model")
     if model == "none":
         return DepthCorrection()
-    if model == "inverse-depth-poly":
+    if model in (POLYNOMIAL, FIELD):
         coefficients = tuple(float(value) for value in fields["coefficients"])
         if not coefficients or not np.isfinite(coefficients).all():
             raise ValueError(f"camera {name}: depth_correction needs finite coefficients")
         gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
         if len(gradient) != 2 or not np.isfinite(gradient).all():
             raise ValueError(f"camera {name}: image_gradient must be two finite numbers")
-        return DepthCorrection(coefficients, (gradient[0], gradient[1]))
+        return DepthCorrection(
+            coefficients,
+            (gradient[0], gradient[1]),
+            _field(name, fields) if model == FIELD else None,
+        )
     raise ValueError(
         f"camera {name}: depth_correction model {model!r} is unknown "
-        "(known: none, inverse-depth-poly)"
+        f"(known: none, {POLYNOMIAL}, {FIELD})"
     )
+
+
+def _field(name: str, fields: Mapping[str, Any]) -> DepthField:
+    knots = np.asarray(fields["inverse_depth_per_m"], np.float64)
+    control = np.asarray(fields["control_per_m"], np.float64)
+    if (
+        control.ndim != 3
+        or knots.shape != control.shape[:1]
+        or min(control.shape) < 2
+        or min(control.shape[1:]) < 3
+        or not np.isfinite(control).all()
+        or not (np.diff(knots) > 0.0).all()
+    ):
+        raise ValueError(f"camera {name}: the field of depth_correction is not usable")
+    return DepthField(tuple(float(knot) for knot in knots), control)

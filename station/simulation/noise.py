@@ -1,4 +1,4 @@
-"""The errors of a structured-light Kinect v1 on a true depth image.
+"""A structured-light Kinect v1's errors, applied to a true depth image.
 
 Geometry: baseline 75 mm, disparity steps of 1/8 px. Random error and silhouette pixels that flicker
 and fly: Nguyen, Izadi & Lovell 2012. (The reconstruction assumes another published model, that of
@@ -10,12 +10,15 @@ the projector's shadow. Raw values: metres = 0.1236 tan(raw / 2842.5 + 1.1863).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from station.core.kinect_v1 import NO_READING
+from station.simulation.violations import SmoothBias, raw_by_libfreenect
 
 BASELINE_M = 0.075
 _WINDOW_PX = 9
@@ -28,16 +31,24 @@ _MIDDLE_M = 1.0 / 0.6
 Image = NDArray[np.float32]
 
 
-def raw_from_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
+def raw_from_depth(
+    depth_m: NDArray[np.floating], libfreenect_law: bool = False
+) -> NDArray[np.uint16]:
     """The nearest raw 11-bit values; no reading where the depth is 0 or out of range."""
     seen = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
-    raw = 2842.5 * (np.arctan(np.where(seen, depth_m, 1.0) / 0.1236) - 1.1863)
+    safe = np.where(seen, depth_m, 1.0)
+    raw = raw_by_libfreenect(safe) if libfreenect_law else raw_by_tangent(safe)
     return np.where(seen, np.clip(np.rint(raw), 0, NO_READING - 1), NO_READING).astype(np.uint16)
+
+
+def raw_by_tangent(depth_m: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Raw values (not rounded) by the tangent law."""
+    return np.asarray(2842.5 * (np.arctan(depth_m / 0.1236) - 1.1863))
 
 
 @dataclass(frozen=True, slots=True)
 class TrueView:
-    """View of a perfect sensor, (h, w) each."""
+    """The view of a perfect sensor, (h, w) each."""
 
     depth_m: Image
     """Distance along the optical axis; 0 = nothing."""
@@ -50,7 +61,7 @@ class TrueView:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Place of a part of an image in the whole."""
+    """Position of a part of an image in the whole."""
 
     top: int
     left: int
@@ -65,11 +76,17 @@ class UnitError:
     bias_m: float = 0.0
     """Its size at 2 m, growing with z^2."""
     tilt: tuple[float, float] = (0.0, 0.0)
-    """Relative change of it over the image, per half width and half height."""
+    """Relative change over the image, per half width and half height."""
     gain: float = 0.0
     """Relative error of all inverse depths: a baseline or a focal length that is slightly off."""
     curvature: float = 0.0
     """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
+    smooth: SmoothBias | None = None
+    libfreenect_law: bool = False
+    frozen_share: float = 0.0
+    """Share of the noise's variance that is the same in every frame ..."""
+    frozen_seed: tuple[int, ...] = ()
+    """... and which pattern it is."""
 
     def apply(self, depth_m: Image, window: Window | None = None) -> Image:
         """The depths that the unit reports; of a part of the image where a window is given."""
@@ -79,14 +96,25 @@ class UnitError:
         height, width = depth_m.shape
         x = np.linspace(-1.0, 1.0, window.image_width, dtype=np.float32)
         y = np.linspace(-1.0, 1.0, window.image_height, dtype=np.float32)
-        shape = (
-            1.0
-            + self.tilt[0] * x[None, window.left : window.left + width]
-            + self.tilt[1] * y[window.top : window.top + height, None]
-        )
-        off = 0.25 * self.bias_m * shape * np.square(depth_m) + self.gain * depth_m
-        off += self.curvature * np.square(1.0 - depth_m / _MIDDLE_M)
+        columns = x[None, window.left : window.left + width]
+        rows = y[window.top : window.top + height, None]
+        off = self.offset_m(columns, rows, depth_m)
         return np.where(depth_m > 0.0, depth_m + off, 0.0).astype(np.float32)
+
+    def offset_m(self, x: Any, y: Any, depth_m: Any) -> Any:
+        """Error (...) in metres at x, y from -1 to 1 over the image."""
+        shape = 1.0 + self.tilt[0] * x + self.tilt[1] * y
+        off = 0.25 * self.bias_m * shape * np.square(depth_m) + self.gain * depth_m
+        off = off + self.curvature * np.square(1.0 - depth_m / _MIDDLE_M)
+        if self.smooth is not None:
+            off = off + self.smooth.offset_m(x, y, depth_m)
+        return off
+
+    def decoded_m(self, depth_m: Any) -> Any:
+        """Depth that the station makes of a depth that the unit encodes by its own law."""
+        if not self.libfreenect_law:
+            return depth_m
+        return 0.1236 * np.tan(raw_by_libfreenect(depth_m) / 2842.5 + 1.1863)
 
 
 def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
@@ -99,33 +127,57 @@ def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class NoiselessView:
-    """Readings of one unit without noise, (h, w) each."""
+    """The readings of one unit without noise, (h, w) each."""
 
     depth_m: Image
     seen: NDArray[np.bool_]
     sigma_m: Image
     fade: Image
     """Probability of no reading at a slant."""
+    unit: UnitError
+    frozen: Image | None
+    """The part of the noise that stays, of unit variance."""
 
     @classmethod
     def of(cls, view: TrueView, unit: UnitError, window: Window | None = None) -> NoiselessView:
-        """Readings of a view, or of the part of it in a window."""
+        """The unit's view; of a part of the image where a window is given."""
         depth = unit.apply(view.depth_m, window)
+        whole = window or Window(0, 0, *depth.shape)
+        frozen = None
+        if unit.frozen_share:
+            pattern = _frozen_pattern(unit.frozen_seed, whole.image_height, whole.image_width)
+            height, width = depth.shape
+            frozen = pattern[whole.top : whole.top + height, whole.left : whole.left + width]
         return cls(
             depth_m=depth,
             seen=(depth > 0) & view.lit & view.reflects,
             sigma_m=axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD)),
             fade=(view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD),
+            unit=unit,
+            frozen=frozen,
         )
 
     def read(self, rng: np.random.Generator) -> NDArray[np.uint16]:
         """One noisy raw 11-bit frame (h, w)."""
-        white = rng.standard_normal(self.depth_m.shape, dtype=np.float32)
-        blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
-        noise = blurred / max(float(blurred.std()), 1e-6)
+        noise = _correlated(rng, self.depth_m.shape)
+        if self.frozen is not None:
+            share = self.unit.frozen_share
+            noise = np.sqrt(1.0 - share) * noise + np.sqrt(share) * self.frozen
         measured = np.where(self.seen, self.depth_m + self.sigma_m * noise, 0.0).astype(np.float32)
         measured[rng.random(self.depth_m.shape, dtype=np.float32) < self.fade] = 0.0
-        return raw_from_depth(_flying(measured, rng))
+        return raw_from_depth(_flying(measured, rng), self.unit.libfreenect_law)
+
+
+def _correlated(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
+    """Noise (h, w) of unit variance, correlated over the matching window."""
+    white = rng.standard_normal(shape, dtype=np.float32)
+    blurred = cv2.GaussianBlur(white, (_WINDOW_PX, _WINDOW_PX), 1.6)
+    return np.asarray(blurred / max(float(blurred.std()), 1e-6), np.float32)
+
+
+@lru_cache(maxsize=16)
+def _frozen_pattern(seed: tuple[int, ...], height: int, width: int) -> Image:
+    return _correlated(np.random.default_rng(seed), (height, width))
 
 
 def observe(

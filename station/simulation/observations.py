@@ -8,21 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.ball import find_ball
-from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
-from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.detect.scene import static_view
-from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
-from station.core.rig import CameraCalibration
-from station.sensors.clock import DeviceClock
-from station.simulation.procedure import (
+from station.calibration.detect.detections import (
     AROUND,
     BALL,
     EMPTY,
     FRONT,
     MARK,
-    STRIDE,
-    VirtualProcedure,
+    STAND,
+    BallDetection,
+    Observations,
+    PlaneObservation,
 )
+from station.calibration.detect.planes import observe_floor, observe_wall
+from station.calibration.detect.scene import static_view
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
+from station.core.rig import CameraCalibration
+from station.sensors.clock import DeviceClock
+from station.simulation.procedure import STRIDE, VirtualProcedure
 from station.simulation.sensor import TICK_HZ
 
 _Depth = NDArray[np.uint16]
@@ -34,7 +36,7 @@ _LOOK_S = 1.0
 
 
 def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observations:
-    """Observations of one camera: the ball's path and resting places, floor, boards."""
+    """The observations of one camera: waved and resting ball, floor, boards."""
     name = camera.name
     index = list(procedure.booth.rig.cameras).index(name)
     rng = np.random.default_rng((procedure.booth.seed, index, 4))
@@ -68,7 +70,9 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
             planes.append(
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )
-    around = {step: balls(step, _LOOK_S) for step in procedure.steps if step.startswith(AROUND)}
+    around = {
+        step: balls(step, _LOOK_S) for step in procedure.steps if step.startswith((AROUND, STAND))
+    }
     return Observations(
         waved, mark, front, [plane for plane in planes if plane is not None], around
     )

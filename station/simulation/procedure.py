@@ -10,8 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.detect.detections import AROUND, BALL, EMPTY, FRONT, MARK, STAND
 from station.core.errors import InputError
 from station.core.kinect_v1 import INDEPENDENT_HZ
+from station.simulation import violations
 from station.simulation.noise import NoiselessView, TrueView, observe
 from station.simulation.round_objects import Capsule, ball, overlay
 from station.simulation.scene import VirtualScene, box, uneven
@@ -24,40 +26,44 @@ from station.simulation.sensor import (
 
 Array = NDArray[np.float64]
 
-EMPTY, BALL, MARK, FRONT, AROUND = "empty", "ball", "mark", "front", "around"
 STRIDE = FRAME_RATE_HZ / INDEPENDENT_HZ
-"""No more frames of a ball are looked at."""
+"""Every so many frames of a ball are used."""
 _REST_S = 2.0
 _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""
 _STILL_FRAMES = 8
 _BOARD_M = (1.2, 2.1)
 _BOARD_THICK_M = 0.02
+_TAPE_M = 1e-3
+"""Largest error of a height that was measured with a tape."""
 
 
 @dataclass(frozen=True)
 class VirtualProcedure:
-    """A virtual calibration as the cameras see it; the same seed gives the same frames."""
+    """The frames of a whole calibration; the same seed gives the same frames."""
 
     booth: SimulatedBooth = field(default_factory=SimulatedBooth)
     radius_m: float = 0.1
     waving_s: float = 60.0
     front_m: float = 0.5
-    """Distance in front of the mark at which the ball rests the second time."""
+    """Distance of the ball in front of the mark when it rests there."""
     board_at_m: tuple[float, ...] = (-0.6, -0.2, 0.2, 0.6)
     """y of the board's middle at each of its places."""
     around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
     """x, y of the ball at each of its places on the floor around the mark."""
+    stand_m: tuple[float, ...] = (0.9, 1.7)
+    """Stated heights of the ball's underside above the floor, on a stand on the mark."""
     _views: dict[tuple[str, float | None], TrueView] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """In the order in which they are done."""
+        """All steps in their order."""
         walls = (f"wall-{i}" for i in range(len(self.board_at_m)))
         around = (f"{AROUND}-{i}" for i in range(len(self.around_m)))
-        return (EMPTY, BALL, MARK, FRONT, *walls, *around)
+        stands = (f"{STAND}-{round(1e3 * height)}" for height in self.stand_m)
+        return (EMPTY, BALL, MARK, FRONT, *walls, *around, *stands)
 
     def starts_s(self, step: str) -> float:
         """True time at which a step begins."""
@@ -73,12 +79,12 @@ class VirtualProcedure:
     ) -> Iterator[VirtualFrame]:
         """A camera's frames of a step: every stride-th of 30 a second, on the average."""
         unit = SimulatedUnit.of(self.booth, camera)
-        calibration = self.booth.rig.cameras[camera]
+        calibration = unit.camera
         index = list(self.booth.rig.cameras).index(camera)
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, self._board_y_m(step))
         # The background is a short loop with noise; only moving objects are drawn in each frame.
-        moves = step in (BALL, MARK, FRONT) or step.startswith(AROUND)
+        moves = step in (BALL, MARK, FRONT) or step.startswith((AROUND, STAND))
         still = NoiselessView.of(view, unit.error)
         loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
@@ -101,7 +107,7 @@ class VirtualProcedure:
             yield VirtualFrame(time_s, unit.ticks(time_s), sequence, raw)
 
     def ball_center_m(self, time_s: float) -> Array:
-        """True centre of the waved ball, world frame."""
+        """True position (3,) of the waved ball, world frame."""
         return self._path.at(time_s - self.starts_s(BALL))
 
     def _lasts_s(self, step: str) -> float:
@@ -113,7 +119,7 @@ class VirtualProcedure:
         )
 
     def _still(self, camera: str, board_y_m: float | None) -> TrueView:
-        """View of everything that does not move; most steps share it."""
+        """The view of everything fixed; most steps share it."""
         if (camera, board_y_m) not in self._views:
             meshes = self.booth.fixtures
             if board_y_m is not None:
@@ -122,23 +128,55 @@ class VirtualProcedure:
                 board = box((-half, near, 0.0), (half, far, high))
                 rng = np.random.default_rng((self.booth.seed, 8))
                 meshes.append(uneven(board, 1, self.booth.uneven_board_m, rng))
-            calibration = self.booth.rig.cameras[camera]
+            calibration = SimulatedUnit.of(self.booth, camera).camera
             view = VirtualScene(meshes).view(calibration, calibration.world_from_camera)
             self._views[camera, board_y_m] = view
         return self._views[camera, board_y_m]
 
-    def _moving(self, step: str, time_s: float) -> list[Capsule]:
-        if step == BALL:
-            center = self.ball_center_m(time_s)
-            return [ball(center, self.radius_m), *self._path.person(center, time_s, self.radius_m)]
-        if step == MARK:
-            return [ball(np.array([0.0, 0.0, self.radius_m]), self.radius_m)]
+    @property
+    def true_radius_m(self) -> float:
+        """The ball's, as it is; ``radius_m`` is what the operator states."""
+        return self.radius_m * violations.ball_scale(self.booth.violations, self.booth.seed)
+
+    @property
+    def oval_share(self) -> float:
+        return violations.oval_share(self.booth.violations)
+
+    def axis(self, step: str, time_s: float) -> Array:
+        """Long axis (3,) of a ball that is oval."""
+        heading = self._path.heading(time_s) if step == BALL else 0.0
+        return violations.oval_axis(self.booth.seed, heading)
+
+    def resting_m(self, step: str) -> Array:
+        """True centre (3,) of the ball that rests in a step."""
+        x, y, height = 0.0, 0.0, 0.0
         if step == FRONT:
-            return [ball(np.array([0.0, -self.front_m, self.radius_m]), self.radius_m)]
-        if step.startswith(AROUND):
+            y = -self.front_m
+        elif step.startswith(AROUND):
             x, y = self.around_m[int(step.removeprefix(f"{AROUND}-"))]
-            return [ball(np.array([x, y, self.radius_m]), self.radius_m)]
-        return []
+        elif step.startswith(STAND):
+            stated_mm = int(step.removeprefix(f"{STAND}-"))
+            rng = np.random.default_rng((self.booth.seed, 11, stated_mm))
+            height = 1e-3 * stated_mm + rng.uniform(-_TAPE_M, _TAPE_M)
+        bow = violations.bow_m(self.booth.violations, self.booth.seed, np.array(x), np.array(y))
+        return np.array([x, y, height + float(bow) + self.true_radius_m])
+
+    def _moving(self, step: str, time_s: float) -> list[Capsule]:
+        if step == EMPTY or step.startswith("wall-"):
+            return []
+        radius_m, switches = self.true_radius_m, self.booth.violations
+        center = self.ball_center_m(time_s) if step == BALL else self.resting_m(step)
+        shapes = [ball(center, radius_m, self.axis(step, time_s), self.oval_share)]
+        if step == BALL:
+            shapes += self._path.person(
+                center, time_s, radius_m, covers=violations.HAND in switches
+            )
+            if violations.HELPER in switches:
+                shapes += self._path.helper(time_s)
+        elif step.startswith(STAND):
+            foot = center * (1.0, 1.0, 0.0)
+            shapes.append(Capsule(foot, center - (0.0, 0.0, radius_m + 0.012), 0.012))
+        return shapes
 
     @cached_property
     def _path(self) -> _Waving:
@@ -175,15 +213,41 @@ class _Waving:
         angle = 2.0 * np.pi * self.rate_hz * time_s + self.phase_rad
         return np.asarray(self.middle_m + np.sum(self.size_m * np.sin(angle), axis=0))
 
-    def person(self, center_m: Array, time_s: float, radius_m: float) -> list[Capsule]:
-        """Fingers, hand, arm, trunk and head of whoever holds the ball."""
-        heading = self.heading_rad + self.turn_rad_s * time_s
+    def heading(self, time_s: float) -> float:
+        """Direction of the person from the ball, radians."""
+        return self.heading_rad + self.turn_rad_s * time_s
+
+    def helper(self, time_s: float) -> list[Capsule]:
+        """Trunk, arm and head of somebody who walks along the edge of the booth."""
+        angle = self.heading_rad + 2.0 + 0.35 * np.sin(0.4 * time_s)
+        foot = 0.85 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        up, side = np.array([0.0, 0.0, 1.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+        hand = foot - 0.2 * foot + (1.0 + 0.2 * np.sin(1.3 * time_s)) * up
+        return [
+            Capsule(foot + 0.15 * up, foot + 1.3 * up, 0.16),
+            Capsule(foot + 1.58 * up, foot + 1.65 * up, 0.085),
+            Capsule(foot + 1.3 * up + 0.2 * side, hand + 0.2 * side, 0.045),
+            ball(hand + 0.2 * side, 0.06),
+        ]
+
+    def person(
+        self, center_m: Array, time_s: float, radius_m: float, covers: bool = False
+    ) -> list[Capsule]:
+        """Fingers, hand, arm, trunk and head of whoever holds the ball.
+
+        ``covers``: the grip moves around the ball, and palm and fingers lie over it.
+        """
+        heading = self.heading(time_s)
         away = np.array([np.cos(heading), np.sin(heading), 0.0])
         across = np.array([-away[1], away[0], 0.0])
         shoulder = center_m + 0.5 * away
         shoulder[2] = np.clip(center_m[2] + 0.05, 0.75, 1.4)
         grip = shoulder - center_m - (0.0, 0.0, 0.35)
         grip /= np.linalg.norm(grip)
+        if covers:
+            turn = 0.9 * np.sin(0.31 * time_s + self.heading_rad) * np.pi
+            grip = np.cos(turn) * grip + np.sin(turn) * np.cross(across, grip)
+            grip = grip / np.linalg.norm(grip)
         hand = center_m + (radius_m + 0.025) * grip
         elbow = 0.5 * (hand + shoulder) - (0.0, 0.0, 0.12)
         parts = [
@@ -195,6 +259,11 @@ class _Waving:
             side = across * np.cos(spread) + np.cross(grip, across) * np.sin(spread)
             tip = 0.75 * grip + 0.66 * side
             parts.append(Capsule(hand, center_m + (radius_m + 0.006) * tip, 0.009))
+            if covers:
+                knuckle = center_m + (radius_m + 0.004) * tip / np.linalg.norm(tip)
+                flat = 0.15 * grip + side
+                end = center_m + (radius_m + 0.002) * flat / np.linalg.norm(flat)
+                parts += [Capsule(hand, knuckle, 0.014), Capsule(knuckle, end, 0.011)]
         trunk = shoulder + 0.22 * away - 0.1 * across
         hip = trunk.copy()
         hip[2] = 0.15

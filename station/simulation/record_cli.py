@@ -10,8 +10,9 @@ from pathlib import Path
 
 import click
 
+from station.calibration.detect.detections import EMPTY
 from station.sensors.recording import RecordedFrame, write_recording
-from station.simulation.procedure import EMPTY, STRIDE, VirtualProcedure
+from station.simulation.procedure import STRIDE, VirtualProcedure
 from station.simulation.scene import fixed_posts, load_mesh
 from station.simulation.sensor import (
     TICK_HZ,

@@ -1,4 +1,4 @@
-"""Balls and limbs that move through a virtual booth, seen exactly and fast.
+"""Balls and limbs that move through a virtual booth, rendered in closed form.
 
 A calibration looks at tens of thousands of frames in which little moves: static objects are ray
 cast once, and balls and capsules (rods with round ends) are overlaid in closed form.
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.geometry import invert, transform
+from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from station.simulation.noise import BASELINE_M, TrueView, Window
 
@@ -30,11 +31,17 @@ class Capsule:
     start_m: Array
     end_m: Array
     radius_m: float
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    stretch: float = 0.0
+    """A ball that is longer along ``axis`` by this share."""
 
 
-def ball(center_m: Array, radius_m: float) -> Capsule:
-    """A ball."""
-    return Capsule(center_m, center_m, radius_m)
+def ball(
+    center_m: Array, radius_m: float, axis: Array | None = None, stretch: float = 0.0
+) -> Capsule:
+    """A ball, or one that is longer along an axis."""
+    x, y, z = (0.0, 0.0, 1.0) if axis is None else (float(value) for value in axis)
+    return Capsule(center_m, center_m, radius_m, (x, y, z), stretch)
 
 
 def overlay(
@@ -54,6 +61,8 @@ def overlay(
                 *transform(camera_from_world, capsule.start_m),
                 *transform(camera_from_world, capsule.end_m),
                 capsule.radius_m,
+                *(camera_from_world[:3, :3] @ capsule.axis),
+                1.0 / (1.0 + capsule.stretch) - 1.0,
             )
             for capsule in capsules
         ]
@@ -71,9 +80,9 @@ def overlay(
         still.lit[part].copy(),
         still.reflects[part].copy(),
     )
-    K = camera.K
+    ray = rays(camera)[part].astype(np.float64)
     _draw(
-        shapes, bounds - (left, top, left, top), K[0, 0], K[1, 1], K[0, 2] - left, K[1, 2] - top,
+        shapes, bounds - (left, top, left, top), ray,
         BASELINE_M, view.depth_m, view.incidence_rad, view.lit, view.reflects,
     )  # fmt: skip
     return view, Window(int(top), int(left), *still.depth_m.shape)
@@ -109,6 +118,14 @@ def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # prag
     dd = dx * dx + dy * dy + dz * dz
     bb = bx * bx + by * by + bz * bz
     mx, my, mz = ox - ax, oy - ay, oz - az
+    # A stretched ball is a ball once space is shrunk along its axis; the ray parameter stays.
+    shrink = shape[10]
+    if shrink != 0.0:
+        along_m = shrink * (mx * shape[7] + my * shape[8] + mz * shape[9])
+        along_d = shrink * (dx * shape[7] + dy * shape[8] + dz * shape[9])
+        mx, my, mz = mx + along_m * shape[7], my + along_m * shape[8], mz + along_m * shape[9]
+        dx, dy, dz = dx + along_d * shape[7], dy + along_d * shape[8], dz + along_d * shape[9]
+        dd = dx * dx + dy * dy + dz * dz
     if bb > 1e-12:
         bd = bx * dx + by * dy + bz * dz
         bm = bx * mx + by * my + bz * mz
@@ -141,12 +158,11 @@ def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]  # prag
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(shapes, bounds, fx, fy, cx, cy, baseline, depth, incidence, lit, reflects):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _draw(shapes, bounds, ray, baseline, depth, incidence, lit, reflects):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(len(shapes)):
         for v in range(bounds[i, 1], bounds[i, 3]):
-            y = (v - cy) / fy
             for u in range(bounds[i, 0], bounds[i, 2]):
-                x = (u - cx) / fx
+                x, y = ray[v, u, 0], ray[v, u, 1]
                 t, nx, ny, nz = _hit(shapes[i], 0.0, 0.0, 0.0, x, y, 1.0)
                 if t < np.inf and (depth[v, u] == 0.0 or t < depth[v, u]):
                     cosine = abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0)
@@ -156,12 +172,11 @@ def _draw(shapes, bounds, fx, fy, cx, cy, baseline, depth, incidence, lit, refle
                     reflects[v, u] = True
     for i in range(len(shapes)):
         for v in range(bounds[i, 1], bounds[i, 3]):
-            y = (v - cy) / fy
             for u in range(bounds[i, 0], bounds[i, 2]):
                 z = depth[v, u]
                 if not lit[v, u] or z == 0.0:
                     continue
-                tx, ty, tz = (u - cx) / fx * z - baseline, y * z, z
+                tx, ty, tz = ray[v, u, 0] * z - baseline, ray[v, u, 1] * z, z
                 reach = 1.0 - _SHADOW_TOLERANCE_M / np.sqrt(tx * tx + ty * ty + tz * tz)
                 if _hit(shapes[i], baseline, 0.0, 0.0, tx, ty, tz)[0] < reach:
                     lit[v, u] = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from station.core.errors import InputError
 from station.core.geometry import rigid, se3_exp, transform
+from station.core.lens import rays as lens_rays
 from station.core.rig import CameraCalibration, DepthCorrection, Rig
 from station.simulation.noise import BASELINE_M, TrueView
 
@@ -26,7 +27,9 @@ _SHADOW_TOLERANCE_M = 0.01
 _BUMP_M = 0.1
 _BUMP_WAVES = 100
 _BUMP_HALVINGS = 6
-"""Number of times a box's edges are halved: a floor's triangles come to 66 mm."""
+"""Halvings of a box's edges: a floor's triangles come to 66 mm."""
+_FINE_VERTICES = 100
+"""A mesh of fewer has not been subdivided yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,18 @@ def uneven(flat: Mesh, axis: int, sigma_m: float, rng: np.random.Generator) -> M
     vertices[:, axis] += (
         sigma_m * np.sqrt(2.0 / _BUMP_WAVES) * np.cos(across @ waves + phases).sum(1)
     )
+    return Mesh(vertices, np.asarray(shape.triangles, np.int32))
+
+
+def bent(flat: Mesh, height_m: Callable[[Array, Array], Array]) -> Mesh:
+    """A floor raised by a height over x, y (metres)."""
+    shape = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(flat.vertices), o3d.utility.Vector3iVector(flat.faces)
+    )
+    if len(flat.vertices) < _FINE_VERTICES:
+        shape = shape.subdivide_midpoint(_BUMP_HALVINGS)
+    vertices = np.asarray(shape.vertices).copy()
+    vertices[:, 2] += height_m(vertices[:, 0], vertices[:, 1])
     return Mesh(vertices, np.asarray(shape.triangles, np.int32))
 
 
@@ -215,14 +230,9 @@ class VirtualScene:
         )
 
     def view(self, camera: CameraCalibration, world_from_camera: Array) -> TrueView:
-        """View of a perfect sensor at a pose; lens distortion is not simulated."""
+        """The view of a perfect sensor with the camera's lens at a pose."""
         height, width = camera.height, camera.width
-        u, v = np.meshgrid(np.arange(width), np.arange(height))
-        K = camera.K
-        directions = np.stack(
-            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u, float)], axis=-1
-        )
-        turned = directions @ world_from_camera[:3, :3].T
+        turned = lens_rays(camera).astype(np.float64) @ world_from_camera[:3, :3].T
         rays = np.empty((height, width, 6), np.float32)
         rays[..., :3], rays[..., 3:] = world_from_camera[:3, 3], turned
         found = self._scene.cast_rays(o3d.core.Tensor(rays))

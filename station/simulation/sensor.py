@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.errors import InputError
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
-from station.core.rig import Rig
+from station.core.rig import CameraCalibration, Rig
 from station.sensors.recording import RecordedFrame
+from station.simulation import violations
 from station.simulation.noise import TrueView, UnitError, observe
 from station.simulation.scene import (
     Mesh,
     VirtualScene,
+    bent,
     booth_walls,
     default_rig,
     moved,
@@ -37,13 +39,13 @@ _FACTORY_SIGMA = (3e-4, 1.5e-3)
 
 @dataclass(frozen=True, slots=True)
 class SimulatedBooth:
-    """Conditions in a virtual booth; the defaults are an ordinary day."""
+    """Properties and faults of a virtual booth; the defaults are an ordinary day."""
 
     rig: Rig = field(default_factory=default_rig)
     """The calibration that the station believes."""
     seed: int = 0
     sway_m: float = 0.002
-    """Motion of the head to either side, with a period of three seconds."""
+    """Amplitude of the head's sway, with a period of three seconds."""
     bias_m: float = 0.0
     """Size of each unit's systematic depth error at 2 m."""
     drop_rate: float = 0.0
@@ -55,18 +57,23 @@ class SimulatedBooth:
     clutter: Sequence[Mesh] = ()
     """Further objects: a chair, a second person."""
     walls: bool = True
+    violations: frozenset[str] = frozenset()
+    """Names of `station.simulation.violations` that are switched on."""
     uneven_floor_m: float = 0.0
     uneven_board_m: float = 0.0
-    """Unevenness of its floor, and of a board held up in it."""
+    """Unevenness of the floor, and of a board held up in the booth, rms."""
 
     @property
     def fixtures(self) -> list[Mesh]:
-        """Objects in it beside the person."""
+        """Everything fixed in the booth."""
         if not self.walls:
             return [*self.clutter]
         floor, *walls = booth_walls()
         rng = np.random.default_rng((self.seed, 6))
-        return [uneven(floor, 2, self.uneven_floor_m, rng), *walls, *self.clutter]
+        floor = uneven(floor, 2, self.uneven_floor_m, rng)
+        if violations.FLOOR in self.violations:
+            floor = bent(floor, lambda x, y: violations.bow_m(self.violations, self.seed, x, y))
+        return [floor, *walls, *self.clutter]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +88,11 @@ class VirtualFrame:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedUnit:
-    """Individual errors of one sensor."""
+    """The properties of one simulated sensor."""
 
     error: UnitError
+    camera: CameraCalibration
+    """The true lens of the unit; the booth's rig has the one that its driver states."""
     drift: float
     phase_s: float
     first_tick: int
@@ -98,7 +107,14 @@ class SimulatedUnit:
             error=UnitError(
                 booth.bias_m * rng.uniform(-1.0, 1.0),
                 tuple(rng.uniform(-0.3, 0.3, 2)),
-                *(made if booth.bias_m else (0.0, 0.0)),
+                *_with_gain(made if booth.bias_m else np.zeros(2), booth, index),
+                violations.smooth_bias(booth.violations, booth.seed, index),
+                violations.RAW_LAW in booth.violations,
+                violations.frozen_share(booth.violations),
+                (booth.seed, index, 10),
+            ),
+            camera=violations.true_lens(
+                booth.violations, booth.seed, index, booth.rig.cameras[name]
             ),
             drift=rng.uniform(-80e-6, 80e-6),
             phase_s=rng.uniform(0.0, 1.0 / FRAME_RATE_HZ),
@@ -110,15 +126,20 @@ class SimulatedUnit:
         return (self.first_tick + round(time_s * TICK_HZ * (1.0 + self.drift))) % 2**32
 
 
+def _with_gain(made: Array, booth: SimulatedBooth, index: int) -> tuple[float, float]:
+    extra = violations.extra_gain(booth.violations, booth.seed, index)
+    return float(made[0]) + extra, float(made[1])
+
+
 class VirtualCamera:
     """One simulated unit in front of a body; the same seed gives the same frames."""
 
     def __init__(self, booth: SimulatedBooth, name: str, body: Mesh | None) -> None:
-        camera = booth.rig.cameras[name]
         index = list(booth.rig.cameras).index(name)
         self._rng = np.random.default_rng((booth.seed, index))
-        self._booth, self._camera = booth, camera
+        self._booth = booth
         self.unit = SimulatedUnit.of(booth, name)
+        self._camera = self.unit.camera
         self._body = body
         # One person, one sway: all cameras see the same phase.
         self._sway_phase = float(np.random.default_rng((booth.seed, 7, 7)).random())
@@ -134,7 +155,7 @@ class VirtualCamera:
             yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
 
     def _view(self, time_s: float) -> TrueView:
-        """View of a perfect sensor at a time, rendered once for each lean."""
+        """The view of a perfect sensor at a time, rendered once for each lean."""
         booth, camera = self._booth, self._camera
         turns = time_s / _SWAY_PERIOD_S + self._sway_phase
         sway_m = 0.0 if self._body is None else booth.sway_m

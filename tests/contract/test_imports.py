@@ -20,6 +20,7 @@ PURE = (
 )
 PURE_FOLDERS = (
     "station/calibration/detect",
+    "station/calibration/adjust",
     "station/calibration/solve",
     "workers/cloud",
     "workers/scape",

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from station.calibration.guide.session import BALL, EMPTY, JOURNAL, Session
+from station.calibration.detect.detections import BALL, EMPTY
+from station.calibration.guide.session import JOURNAL, Session
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import VirtualProcedure
 from station.simulation.sensor import TICK_HZ

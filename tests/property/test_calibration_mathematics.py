@@ -4,13 +4,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from station.calibration.adjust.equations import ROUNDNESS, TREMOR_M, Balls
+from station.calibration.adjust.sensor_model import BALL, FIELD, FULL, LENS, POLYNOMIAL
+from station.calibration.adjust.trajectory import KNOT_S, TimeGrid, along
 from station.calibration.detect.ball_image import ball_inverse_depth
-from station.calibration.solve.depth_correction import correction_of, design
-from station.calibration.solve.joint import TREMOR_M, trembling
 from station.calibration.solve.pairwise import Track, relate
-from station.calibration.solve.trajectory import KNOT_S, TimeGrid, along
 from station.calibration.solve.world import Placed, relatives
 from station.core.geometry import invert, se3_exp, transform, twist_between
+from station.core.lens import pixel_rays
+from station.simulation.scene import default_rig
 
 SEEDS = st.integers(0, 10_000)
 
@@ -33,28 +35,57 @@ def test_a_balls_inverse_depth_and_its_derivative(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=20, deadline=None)
-def test_a_tremor_widens_a_centres_covariance_and_moves_nothing(seed: int) -> None:
+def test_nuisance_of_a_detection_widens_its_covariance_and_moves_nothing(seed: int) -> None:
+    """A tremor of the hand and a ball that is not quite round must not pull the centre."""
     rng = np.random.default_rng(seed)
-    rows = rng.normal(0, 1e3, (2, 20, 8))
-    normal, pull = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, 8))
-    loose, loose_pull = trembling(normal, pull)
-    before, after = (np.linalg.inv(matrix[:, :3, :3]) for matrix in (normal, loose))
-    assert np.allclose(after, before + TREMOR_M**2 * np.eye(3), rtol=1e-6)
+    rows = rng.normal(0, 1e3, (2, 20, 4))
+    matrix, gradient = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, 4))
+    firm = Balls(matrix, gradient, np.zeros((2, 4, 0)), np.zeros((0, 0)), np.zeros(0))
+    loose = firm.off_center(0.1, np.ones(2))
+    before, after = (np.linalg.inv(balls.matrix) for balls in (firm, loose))
+    prior = np.diag([TREMOR_M**2] * 3 + [(0.1 * ROUNDNESS) ** 2])
+    assert np.allclose(after, before + prior, rtol=1e-6)
     best, still = (
-        np.linalg.solve(a, b[..., None]) for a, b in ((normal, pull), (loose, loose_pull))
+        np.linalg.solve(balls.matrix, balls.gradient[..., None]) for balls in (firm, loose)
     )
     assert np.allclose(best, still, rtol=1e-6)
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_the_correction_is_the_one_that_was_solved_for(seed: int) -> None:
+    """Polynomial, gradient and field act on whole images as they did on single patches."""
     rng = np.random.default_rng(seed)
-    parameters = rng.normal(0, [5e-3, 1e-3, 3e-3, 2e-3, 2e-3])
+    parameters = np.concatenate(
+        [
+            rng.normal(0, [5e-3, 1e-3, 3e-3, 2e-3, 2e-3]),
+            np.zeros(LENS + BALL),
+            rng.normal(0, 1e-3, FIELD),
+        ]
+    )
     depth = rng.uniform(0.8, 3.0, (6, 8))
     y, x = np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 8), indexing="ij")
-    expected = 1.0 / depth + design(1.0 / depth, np.stack([x, y], axis=-1)) @ parameters
-    assert np.allclose(1.0 / correction_of(parameters).apply(depth), expected, atol=1e-7)
+    place = np.stack([x.ravel(), y.ravel()], axis=-1)
+    inverse = 1.0 / depth.ravel()
+    expected = inverse + FULL.change(parameters, inverse, place)
+    correction = FULL.correction(parameters)
+    assert np.allclose(1.0 / correction.apply(depth).ravel(), expected, atol=1e-6)
+    assert np.allclose(correction.inverse_at(inverse, *place.T), expected, atol=1e-9)
+
+
+@given(SEEDS)
+@settings(max_examples=10, deadline=None)
+def test_rays_change_with_the_lens_as_the_solution_assumes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    camera = default_rig().cameras["front-upper"]
+    pixels = rng.uniform((20, 20), (620, 460), (7, 2))
+    parameters = np.zeros(FULL.size)
+    parameters[POLYNOMIAL : POLYNOMIAL + LENS] = rng.normal(0, [1e-3, 1.0, 1.0, 0.005])
+    moved = FULL.camera(camera, parameters)
+    design = FULL.lens_design(camera, pixel_rays(camera, pixels))
+    expected = design @ parameters[POLYNOMIAL : POLYNOMIAL + LENS]
+    change = pixel_rays(moved, pixels) - pixel_rays(camera, pixels)
+    assert np.allclose(change, expected, atol=2e-4)
 
 
 @given(SEEDS)

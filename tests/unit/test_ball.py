@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.ball import find_ball
-from station.calibration.detect.detections import BallDetection, PlaneObservation
+from station.calibration.detect.detections import BALL, EMPTY, BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.core.errors import FormatError
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
 from station.simulation.noise import UnitError, observe
-from station.simulation.procedure import BALL, EMPTY, VirtualProcedure
+from station.simulation.procedure import VirtualProcedure
 from station.simulation.round_objects import Capsule, ball, overlay
 from station.simulation.scene import VirtualScene, booth_walls, default_rig, look_at, sphere
 from station.simulation.sensor import SimulatedBooth

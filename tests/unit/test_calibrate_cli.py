@@ -97,7 +97,7 @@ def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationSto
     """The operator had set up the board before he was told."""
     _begin(store)
     refused = _run(config, "depth")
-    assert "the empty booth has to be looked at first" in str(refused.exception)
+    assert "the empty booth has to be recorded first" in str(refused.exception)
     assert "board" not in refused.output
 
 

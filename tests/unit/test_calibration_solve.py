@@ -2,22 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic_calibration as synthetic
+from scan_distortion import distortion
 
-from station.calibration.detect.detections import BallDetection, Observations
-from station.calibration.solve import joint
+from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Observations
+from station.calibration.solve import solution as solution_module
 from station.calibration.solve.solution import Solution, solve
 from station.calibration.solve.world import relatives
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, transform, twist_between
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import Rig
-from station.simulation.procedure import BALL, VirtualProcedure
-from station.simulation.sensor import SimulatedUnit
+from station.simulation import violations
+from station.simulation.procedure import VirtualProcedure
+from station.simulation.scene import load_mesh
 
+BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
+RATE_HZ = 9.0
+"""Detections a second: enough for the sensors' fields, and quickly solved."""
 REFERENCE, FRONT = "front-upper", ("front-upper", "front-lower")
 
 
@@ -35,7 +41,9 @@ def procedure() -> VirtualProcedure:
 
 @pytest.fixture(scope="module")
 def seen(procedure: VirtualProcedure) -> Observations:
-    return synthetic.observations(procedure, clock_error_s=0.002)
+    return synthetic.observations(
+        procedure, rate_hz=RATE_HZ, clock_error_s=0.002, boards=True, stands=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +63,32 @@ def errors(rig: Rig, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(twists), covariance
 
 
-def test_front_and_back_are_tied_to_a_millimetre(
+def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     procedure: VirtualProcedure, solution: Solution
 ) -> None:
     twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
     assert np.degrees(np.linalg.norm(twists[:, :3], axis=1)).max() < 0.1
+    found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
+    assert found.normal_rms_mm < 0.15
+    assert found.tilt_deg < 0.1
+    assert abs(found.height_mm) < 2.0
+    assert np.abs(found.girths_mm).mean() < 1.0
+    predicted = solution.rig.predicted
+    assert predicted is not None
+    assert abs(found.height_mm) < 3e3 * predicted.height_sigma_m
+
+
+@pytest.mark.parametrize("switch", [violations.BIAS, violations.K1])
+def test_errors_of_another_form_are_found(switch: str) -> None:
+    """Rings, bumps or a distorted lens once passed for a polynomial: girths were off by 12 mm."""
+    procedure = VirtualProcedure(synthetic.booth(121, switches=(switch,)))
+    seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
+    solution = solved(procedure.booth.rig, seen)
+    found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
+    assert found.normal_rms_mm < 0.6
+    assert abs(found.height_mm) < 2.5
+    assert np.abs(found.girths_mm).max() < 5.0
 
 
 def test_what_it_says_of_its_own_errors_is_true() -> None:
@@ -69,7 +97,8 @@ def test_what_it_says_of_its_own_errors_is_true() -> None:
     for seed in (111, 112, 113, 114):
         procedure = VirtualProcedure(synthetic.booth(seed), waving_s=40.0)
         rig = procedure.booth.rig
-        away, covariance = errors(rig, solved(rig, synthetic.observations(procedure)))
+        seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
+        away, covariance = errors(rig, solved(rig, seen))
         total += float(away @ np.linalg.solve(covariance, away))
         unknowns += len(away)
     # 72 unknowns: 99.9 % lie between 0.55 and 1.6 a piece.
@@ -78,7 +107,7 @@ def test_what_it_says_of_its_own_errors_is_true() -> None:
 
 def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None:
     """A sensor that is twice as noisy as it claims is not believed, and priors are no noisier."""
-    seen = synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
+    seen = synthetic.observations(procedure, rate_hz=RATE_HZ)
 
     def boasting(ball: BallDetection) -> BallDetection:
         return replace(ball, patches=ball.patches * (1.0, 1.0, 1.0, 0.25))
@@ -98,19 +127,6 @@ def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None
     assert np.median(shares) > 0.75
 
 
-def test_depth_errors_are_found(procedure: VirtualProcedure, solution: Solution) -> None:
-    """A shift of the disparity that tilts over the image, up to 15 mm at 2 m."""
-    for name, camera in solution.rig.cameras.items():
-        error = SimulatedUnit.of(procedure.booth, name).error
-        y, x = np.mgrid[40:440:100, 40:600:140]
-        for depth in (1.3, 1.7, 2.1):
-            image = np.full((480, 640), depth, np.float32)
-            corrected = camera.depth_correction.apply(error.apply(image))
-            left = np.abs(corrected - depth)[y, x]
-            before = np.abs(error.apply(image) - depth)[y, x]
-            assert left.mean() < max(0.25 * before.mean(), 1.6e-3)
-
-
 def test_the_mark_is_the_origin_and_the_floor_is_zero(
     procedure: VirtualProcedure, solution: Solution
 ) -> None:
@@ -124,13 +140,17 @@ def test_the_ball_shows_a_floor_that_no_camera_sees(
     procedure: VirtualProcedure, seen: Observations
 ) -> None:
     """A strip at the edge of one image leaned a booth by 0.2 degrees: 4 mm at a head."""
-    solution = solved(procedure.booth.rig, replace(seen, planes=()))
+    solution = solved(
+        procedure.booth.rig,
+        replace(seen, planes=[plane for plane in seen.planes if plane.surface != FLOOR]),
+    )
     for name, camera in procedure.booth.rig.cameras.items():
         ours = solution.rig.cameras[name].world_from_camera
         up, true_up = ours[2, :3], camera.world_from_camera[2, :3]
         assert np.degrees(np.arccos(min(float(up @ true_up), 1.0))) < 0.1
         assert abs(ours[2, 3] - camera.world_from_camera[2, 3]) < 4e-3
-    assert solution.placed.slope_sigma_rad < np.radians(0.08)
+    # What balls on the floor show of its slope is limited by how far it may be bowed.
+    assert solution.placed.slope_sigma_rad < np.radians(0.15)
 
 
 def test_a_slope_that_is_hardly_known_is_refused() -> None:
@@ -172,7 +192,8 @@ def test_it_can_be_reported_and_read_again(
     solution.rig.save(path)
     found = Rig.load(path)
     for name, camera in solution.rig.cameras.items():
-        assert found.cameras[name].depth_correction == camera.depth_correction
+        ours = found.cameras[name].depth_correction.to_json()
+        assert ours == camera.depth_correction.to_json()
         assert camera.covariance is not None
         assert np.linalg.eigvalsh(camera.covariance).min() > 0
     assert len(solution.summary()) >= 6
@@ -224,7 +245,7 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure
 def test_what_does_not_settle_is_refused(
     procedure: VirtualProcedure, seen: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(joint, "_ITERATIONS", 1)
+    monkeypatch.setattr(solution_module, "_FINE_ITERATIONS", 1)
     with pytest.raises(CalibrationError, match="the cameras contradict one another"):
         solved(procedure.booth.rig, seen)
 
@@ -273,15 +294,16 @@ def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
 
 def test_a_sensor_far_off_its_factory_scale_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A prior with light tails shared the error out among all cameras: 5 mm from front to back."""
-    measured = synthetic._measured
+    reported = synthetic.reported
 
-    def off(unit, camera, u, v, w):  # type: ignore[no-untyped-def]
-        scale = 0.994 if camera.name == "back-lower" else 1.0
-        return scale * measured(unit, camera, u, v, w)
+    def off(unit, pixels, depth_m):  # type: ignore[no-untyped-def]
+        scale = 0.994 if unit.camera.name == "back-lower" else 1.0
+        return reported(unit, pixels, depth_m) / scale
 
-    monkeypatch.setattr(synthetic, "_measured", off)
+    monkeypatch.setattr(synthetic, "reported", off)
     procedure = VirtualProcedure(synthetic.booth(130))
     rig = procedure.booth.rig
-    solution = solved(rig, synthetic.observations(procedure))
-    twists = errors(rig, solution)[0].reshape(-1, 6)
+    seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
+    twists_of = solved(rig, seen)
+    twists = errors(rig, twists_of)[0].reshape(-1, 6)
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2e-3

@@ -16,7 +16,8 @@ from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
 from station.calibration.guide.steps import wave_ball
-from station.core.kinect_v1 import INDEPENDENT_HZ
+from station.core.kinect_v1 import DEPTH_SCALE_M, INDEPENDENT_HZ, TABLE
+from station.sensors.recording import RecordedFrame, check_recording, write_recording
 from station.simulation.scene import default_rig
 
 _CAMERAS = ("front-lower", "front-upper")
@@ -99,3 +100,38 @@ def test_no_more_frames_are_looked_at_than_are_worth_it(
             looking.look(TimedFrame(_CAMERAS[0], time_s, image, 1e-3) for time_s in times)
         looking.found(wait=True)
     assert len(looked) == 2 * INDEPENDENT_HZ
+
+
+def test_frames_of_a_replay_that_wait_are_kept_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A minute of replayed frames took 2 GB while the search was behind."""
+    recording = tmp_path / "recording"
+    raw = [np.full((480, 640), 600 + number, np.uint16) for number in range(20)]
+    frames = [RecordedFrame(0.1 * n, 6_000_000 * (n + 1), image) for n, image in enumerate(raw)]
+    write_recording(recording, frames, tick_hz=60_000_000)
+    held: list[int] = []
+    seen: list[float] = []
+
+    class Frame(TimedFrame):
+        def depth_m(self) -> np.ndarray:
+            held.append(self.depth.size)
+            return super().depth_m()
+
+    def find_slowly(depth_m: np.ndarray, *_: Any, **__: Any) -> None:
+        time.sleep(0.01)
+        seen.append(float(depth_m[0, 0]))
+
+    monkeypatch.setattr(finder, "find_ball", find_slowly)
+    session = Session.begin(
+        tmp_path / "session", "2026-11-21T10:00:00Z", 0.1,
+        {_CAMERAS[0]: default_rig().cameras[_CAMERAS[0]]},
+    )  # fmt: skip
+    with BallFinder(session, patient=True) as looking:
+        looking.look(
+            Frame(_CAMERAS[0], seconds, TABLE[image], DEPTH_SCALE_M, file=file)
+            for image, (seconds, _, file) in zip(raw, check_recording(recording), strict=True)
+        )
+        looking.found(wait=True)
+    assert sum(size > 0 for size in held) < 10
+    assert sorted(seen) == pytest.approx(sorted(TABLE[600:620] * DEPTH_SCALE_M), rel=1e-6)

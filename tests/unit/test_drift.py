@@ -112,7 +112,7 @@ def test_a_bare_wall_says_nothing_of_moves_along_it() -> None:
     along = _view(wall, (0.0, 0.0, 0.0, 0.01, 0.0, 0.0))
     move = estimate_move(bare, _frames(along, 10, seed=7), DEPTH_SCALE_M)
     assert len(move.unseen()) == 3
-    assert {"sideways", "up or down", "tilting"} == set(move.unseen_words())
+    assert {"sideways shift", "vertical shift", "roll"} == set(move.unseen_words())
     nearer = _view(wall, (0.0, 0.0, 0.0, 0.0, 0.0, 0.005))
     assert estimate_move(bare, _frames(nearer, 10, seed=8), DEPTH_SCALE_M).moved
 

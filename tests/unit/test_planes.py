@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from station.calibration.adjust.problem import Surface
 from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.solve.problem import Surface
 from station.core.geometry import invert
+from station.core.lens import pixel_rays
 from station.simulation.scene import (
     Mesh,
     VirtualScene,
@@ -32,7 +33,8 @@ def _deviation(surface: Surface, normal: tuple[float, float, float], distance_m:
     along = camera_from_world[:3, :3] @ normal
     true = along / (distance_m + along @ camera_from_world[:3, 3])
     away = surface.plane - true
-    return float(away @ surface.normal[:3, :3] @ away)
+    ray = np.column_stack([pixel_rays(CAMERA, surface.pixels), np.ones(len(surface.pixels))])
+    return float(away @ (ray.T @ (ray * surface.weight[:, None])) @ away)
 
 
 def test_a_floors_bumps_are_in_its_covariance() -> None:

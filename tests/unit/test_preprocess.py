@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from station.core.config import Volume
 from station.core.errors import InputError
 from station.core.kinect_v1 import RANDOM_SIGMA, STEP
 from station.core.lens import project, rays
-from station.core.rig import CameraCalibration
+from station.core.rig import CameraCalibration, PredictedError
 from station.simulation.scene import Mesh, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
@@ -173,6 +174,14 @@ def test_a_large_step_is_never_missed(tmp_path: Path) -> None:
             shutil.copy(second / name, first / name)
     found = preprocess(read_bundle(first)).findings
     assert {finding.code for finding in found} == {"motion"}
+
+
+def test_what_a_calibration_says_of_its_errors_goes_with_the_scan(bundle: Path) -> None:
+    read = read_bundle(bundle)
+    said = PredictedError(0.002, 0.003, 0.0004, 0.0005)
+    told = replace(read, rig=replace(read.rig, predicted=said))
+    assert preprocess(told).predicted == said
+    assert preprocess(read).predicted is None
 
 
 def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from station.core.depth_image import DepthField
 from station.core.errors import CalibrationError, FormatError
 from station.core.geometry import se3_exp
-from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.core.rig import CameraCalibration, DepthCorrection, PredictedError, Rig
 
 
 def make_rig() -> Rig:
@@ -59,6 +60,25 @@ def test_a_gradient_over_the_image_goes_from_edge_to_edge(tmp_path: Path) -> Non
     path = tmp_path / "calibration.json"
     replace(rig, cameras={camera.name: camera}).save(path)
     assert Rig.load(path).cameras[camera.name].depth_correction == correction
+
+
+def test_a_field_and_predicted_errors_are_read_again(tmp_path: Path) -> None:
+    """The calibration's own errors have to reach the measurements' intervals."""
+    control = np.random.default_rng(3).normal(0.0, 1e-3, (3, 4, 5))
+    correction = DepthCorrection((0.0, 1.0), (0.0, 0.0), DepthField((0.4, 0.7, 1.0), control))
+    rig = make_rig()
+    camera = replace(rig.cameras["front-upper"], depth_correction=correction)
+    predicted = PredictedError(2e-3, 1e-3, 5e-4, 1e-3)
+    path = tmp_path / "calibration.json"
+    replace(rig, cameras={camera.name: camera}, predicted=predicted).save(path)
+    found = Rig.load(path)
+    assert found.predicted == predicted
+    again = found.cameras[camera.name].depth_correction
+    depth = np.full((12, 16), 1.6, np.float32)
+    assert np.array_equal(again.apply(depth), correction.apply(depth))
+    y, x = np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 16), indexing="ij")
+    at = correction.inverse_at(1.0 / depth.ravel().astype(float), x.ravel(), y.ravel())
+    assert np.allclose(1.0 / correction.apply(depth).ravel(), at, atol=1e-6)
 
 
 def _set(*keys: str, value: Any) -> Callable[[dict[str, Any]], None]:

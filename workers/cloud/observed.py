@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth_image import Image
-from station.core.rig import CameraCalibration
+from station.core.rig import CameraCalibration, PredictedError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -70,3 +70,5 @@ class Preprocessed:
     views: tuple[CameraView, ...]
     """Empty for a bare cloud, else one of each of its cameras, in their order."""
     findings: tuple[Finding, ...]
+    predicted: PredictedError | None = None
+    """Errors that the calibration adds by its own statement; None for bare clouds and old files."""

@@ -116,7 +116,7 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         for name in bundle.rig.cameras
         if name not in names
     ]
-    return Preprocessed(_merged(names, clouds), views, tuple(findings))
+    return Preprocessed(_merged(names, clouds), views, tuple(findings), bundle.rig.predicted)
 
 
 def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:

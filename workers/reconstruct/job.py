@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from station.core.bundle import read_bundle
 from station.core.config import Volume
+from station.core.rig import PredictedError
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.cloud.preprocess import warm_up as compile_preprocessing
@@ -142,7 +143,7 @@ def _fitted(
         progress("measuring", 0.0)
         # Measuring and separating limbs do not depend on each other.
         with ThreadPoolExecutor(1) as beside:
-            measuring = beside.submit(_measured, model, overlapping, watch)
+            measuring = beside.submit(_measured, model, overlapping, scan.predicted, watch)
             fit = separate_limbs(model, overlapping, scan.findings, observer)
             measured, standing = measuring.result()
         watch.seconds.update(fit.seconds)
@@ -153,12 +154,18 @@ def _fitted(
 
 
 def _measured(
-    model: BodyModel, fit: OverlappingFit, watch: Stopwatch
+    model: BodyModel, fit: OverlappingFit, predicted: PredictedError | None, watch: Stopwatch
 ) -> tuple[MeasuredBody, MeasuredBody]:
     """Measurements as scanned, and in the standard standing pose."""
     with watch.step("measure"):
         sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
         errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m)
+        if predicted is not None:
+            errors = replace(
+                errors,
+                height_sigma_m=predicted.height_sigma_m,
+                girth_sigma_m=predicted.girth_sigma_m,
+            )
         return (
             measure_body(model, fit.vertices, sigma_m, seen, errors),
             measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors),

@@ -104,7 +104,7 @@ class _Fit:
     spread: float
 
     def unlike(self, radius_m: float) -> float:
-        """Dissimilarity to the ball that is looked for: heads and fists are round, too."""
+        """Dissimilarity from the ball that is searched for: heads and fists are round, too."""
         tolerance_m = np.hypot(_RADIUS_SLACK * radius_m, self.radius_sigma_m)
         away = (self.radius_m - radius_m) / tolerance_m
         return float(away**2 + (max(self.spread - 1.0, 0.0) / 0.2) ** 2)

@@ -1,4 +1,4 @@
-"""Pixels of a ball that show a hand or fingers as well."""
+"""Pixels of a ball that hands and fingers cover or touch."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _STRAY_SIGMAS = 3.0
 _STRAY_CLIP = 12.0
 _STRAY_COSINE = 0.4
 _RING = (1.1, 1.25)
-"""Ring, in radii, outside the flickering silhouette: it shows what holds the ball."""
+"""Shares of the radius: a ring outside the flickering silhouette, where a hand is visible."""
 _FINGERS_M = 0.055
 """Visible reach of fingers of 8 cm, bent round a ball, from the hand."""
 _FINGERS_SHOW_M = 1.7
-"""Up to here a finger is as wide as the mean that shows strays, and stands out by its limit."""
+"""Up to this distance a finger is as wide as the averaging window that reveals strays."""
 
 
 def hands(
@@ -82,7 +82,7 @@ def _held(
 
 
 def _solid(mask: Mask) -> Mask:
-    """Without specks of noise."""
+    """The mask without specks of noise."""
     window = np.ones((3, 3), np.uint8)
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, window) > 0)
 

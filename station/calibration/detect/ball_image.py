@@ -24,7 +24,7 @@ a fit that starts off the ball still has a gradient towards it."""
 
 @numba.njit(cache=True, nogil=True)
 def _meet(x, y, cx, cy, cz, radius, least_share):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """w, s, sqrt(A) and the derivatives of w by cx, cy, cz, R; s = 0 where the ray misses.
+    """w, s, sqrt(A) and the derivatives of w by cx, cy, cz, R, x, y; s = 0 where the ray misses.
 
     ``least_share`` bounds s^2 below by that share of (B R)^2.
     """
@@ -33,7 +33,7 @@ def _meet(x, y, cx, cy, cz, radius, least_share):  # type: ignore[no-untyped-def
     C = cx * cx + cy * cy + cz * cz - radius * radius
     square = max(B * B - A * C, least_share * B * B * (radius * radius))
     if square <= 0.0 or C <= 0.0:
-        return 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     s = np.sqrt(square)
     w = (B + s) / C
     k = B / s
@@ -42,14 +42,16 @@ def _meet(x, y, cx, cy, cz, radius, least_share):  # type: ignore[no-untyped-def
     gy = (y + k * y - j * cy) / C - 2.0 * w * cy / C
     gz = (1.0 + k - j * cz) / C - 2.0 * w * cz / C
     gr = (j * radius) / C + 2.0 * w * radius / C
-    return w, s, np.sqrt(A), gx, gy, gz, gr
+    hx = (cx + k * cx - x * C / s) / C
+    hy = (cy + k * cy - y * C / s) / C
+    return w, s, np.sqrt(A), gx, gy, gz, gr, hx, hy
 
 
 @numba.njit(cache=True, nogil=True)
 def predict(x, y, cx, cy, cz, radius):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Inverse depth of a ball along the ray (x, y, 1), cosine of incidence, and the derivative of
     the inverse depth by centre and radius; cosine 0 where the ray misses."""
-    w, s, length, gx, gy, gz, gr = _meet(x, y, cx, cy, cz, radius, 0.0)
+    w, s, length, gx, gy, gz, gr, _, _ = _meet(x, y, cx, cy, cz, radius, 0.0)
     return w, s / (length * radius), gx, gy, gz, gr
 
 
@@ -62,16 +64,16 @@ def _inverse_depths(center, ray, radius, w, gradient):  # type: ignore[no-untype
                 _GRAZING,
             )  # fmt: skip
             w[i, k] = found[0]
-            for j in range(4):
+            for j in range(6):
                 gradient[i, k, j] = found[3 + j]
 
 
 def ball_inverse_depth(center: Array, ray: Array, radius_m: float) -> tuple[Array, Array]:
     """Inverse depths (n, k) of balls with centres (n, 3) along rays (n, k, 2).
 
-    Also the derivatives (n, k, 4) by centre and radius. Rays that miss count as grazing.
+    Also the derivatives (n, k, 6) by centre, radius and ray. Rays that miss count as grazing.
     """
-    w, gradient = np.empty(ray.shape[:2]), np.empty((*ray.shape[:2], 4))
+    w, gradient = np.empty(ray.shape[:2]), np.empty((*ray.shape[:2], 6))
     _inverse_depths(np.ascontiguousarray(center), np.ascontiguousarray(ray), radius_m, w, gradient)
     return w, gradient
 

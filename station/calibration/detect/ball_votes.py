@@ -1,4 +1,4 @@
-"""Candidates for a ball of known radius in a depth image: pixels vote for its centre.
+"""Candidate positions of a ball of known radius in a depth image: pixels vote for its centre.
 
 Every pixel's normal points away from the centre of the ball that it would lie on, so pixels of the
 ball vote for one place and all others scatter (a Hough transform with known radius).

@@ -42,7 +42,7 @@ _FIXED = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGE
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """The printed board: squares across and down, their size, the markers in them."""
+    """A printed ChArUco board: squares across and down, their size, the markers in them."""
 
     columns: int
     rows: int
@@ -94,7 +94,7 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class LensReport:
-    """The lens of a camera as judged by its views of the board."""
+    """The judgement of a camera's lens from its views."""
 
     camera: str
     views: int
@@ -103,7 +103,7 @@ class LensReport:
     free_m: float
     """The same of the lens that the views give."""
     certain_m: float
-    """Within what the views determine the lens in 95 % of the image at 1.7 m: by how far two
+    """Uncertainty of the lens in 95 % of the image at 1.7 m: how far two
     halves of them disagree."""
     lens: CameraCalibration | None
     """The camera with the new lens where it is to be trusted more."""
@@ -170,7 +170,7 @@ def _check_layout(board: Board, moment: str, pixels: Array, ids: NDArray[np.inte
 
 
 def judge_lens(camera: CameraCalibration, views: Sequence[BoardView], board: Board) -> LensReport:
-    """Whether the views give a better lens than the factory's, measured on held-out views."""
+    """Judge whether the views give a better lens than the factory's, on held-out views."""
     if len(views) < _LEAST_VIEWS:
         return LensReport(camera.name, len(views), np.nan, np.nan, np.nan, None)
     held_out = views[::_HELD_OUT_EVERY]
@@ -251,7 +251,7 @@ def _placed(
 
 
 def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
-    """Distance of two lenses' points of a pixel at the working distance, 95th percentile."""
+    """Distance between the points that two lenses give a pixel at 1.7 m, 95th percentile."""
     u, v = np.meshgrid(np.linspace(0, one.width - 1, 17), np.linspace(0, one.height - 1, 13))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     ahead = [pixel_rays(camera, pixels) for camera in (one, other)]
@@ -262,7 +262,7 @@ def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TieReport:
-    """Errors with which a calibration carries the board from one camera to another."""
+    """Agreement of two cameras on the board's position through a calibration."""
 
     pairs: Mapping[tuple[str, str], float]
     """Rms distance between the two cameras' places of the board's corners, metres."""

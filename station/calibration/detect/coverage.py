@@ -1,8 +1,8 @@
-"""Coverage of the ball's detections, and the operator's next step.
+"""Coverage of the booth by the waved ball, and advice on what to do next.
 
-Known before any pose is: each camera's own image regions and distances, and the moments at which
-two cameras saw the ball together. It is cheap enough to be asked while the ball is waved; whether
-the calibration is good is decided by its solution.
+It uses each camera's image regions and distances, and the moments at which two cameras saw the
+ball together; no pose is needed, so that it can be shown while the ball is waved. Whether the
+calibration is good is decided by its solution.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ENOUGH_TOGETHER = 40
 _TOGETHER_S = 0.06
 _CELL_SEEN = 4
 _CELLS = 6
-"""Number of the nine image regions needed: not every one can be reached within the booth."""
+"""Regions to be filled, of nine: not every one can be reached within the booth."""
 _DEPTH_SPREAD_M = 0.12
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "middle", "right")
 _GO = {"top": "higher", "bottom": "lower", "middle": "at half its height"}
@@ -60,7 +60,7 @@ class Coverage:
         return dict(self._seen)
 
     def ties(self) -> dict[str, tuple[str, int]]:
-        """By which camera, and how many moments, each is tied to the reference, directly or not.
+        """The camera that ties each to the reference, directly or not, and the number of moments.
 
         The strongest ties first (Prim's tree).
         """
@@ -77,7 +77,7 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Share of the needed detections that there is, 0 to 1."""
+        """Share of what is needed, 0 to 1."""
         return float(np.mean([min(1.0, have) for have, _ in self._needs()]))
 
     @property
@@ -85,7 +85,7 @@ class Coverage:
         return all(have >= 1.0 for have, _ in self._needs())
 
     def advice(self) -> str:
-        """The next thing to do, in one line."""
+        """Advice for the operator, in one line."""
         have, words = min(self._needs(), key=lambda need: need[0])
         return "everything is covered" if have >= 1.0 else words
 

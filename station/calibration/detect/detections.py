@@ -1,4 +1,4 @@
-"""Detections of a calibration: balls, and flat surfaces reduced to patches.
+"""Observations of a calibration: balls and flat surfaces, reduced to patches.
 
 A patch is the mean of a few dozen neighbouring pixels: (u, v, inverse depth, variance). It keeps
 what the images say about places *and* about the cameras' depth errors, so that the joint solution
@@ -22,6 +22,11 @@ from station.sensors.base import DeviceInfo
 
 Array = NDArray[np.float64]
 
+EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND = (
+    "empty", "ball", "mark", "front", "wall", "around", "stand",
+)  # fmt: skip
+"""Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
+"stand-1700" by the height in millimetres."""
 FLOOR = "floor"
 
 
@@ -135,18 +140,18 @@ class Observations:
     """All that a calibration is solved from."""
 
     balls: Sequence[BallDetection]
-    """Detections of the ball on its way through the booth, in any order."""
+    """The waved ball, in any order."""
     mark: Sequence[BallDetection] = field(default_factory=tuple)
-    """Detections of the ball resting on the mark."""
+    """The ball resting on the mark."""
     front: Sequence[BallDetection] = field(default_factory=tuple)
-    """Detections of the ball on the floor in front of the mark; they give the heading."""
+    """The ball resting on the floor in front of the mark; gives the heading where present."""
     planes: Sequence[PlaneObservation] = field(default_factory=tuple)
     around: Mapping[str, Sequence[BallDetection]] = field(default_factory=dict)
-    """Detections of the ball on the floor elsewhere: name of the place -> detections."""
+    """The ball resting elsewhere: name of the place -> detections."""
 
     @classmethod
     def merged(cls, parts: Iterable[Self]) -> Self:
-        """Observations of several cameras as one."""
+        """The observations of several cameras of one calibration."""
         listed = list(parts)
         places = dict.fromkeys(place for part in listed for place in part.around)
         return cls(

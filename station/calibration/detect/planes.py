@@ -6,13 +6,15 @@ mean over a cell of pixels is exact, and three pixels give a plane without more 
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.detections import FLOOR, PlaneObservation
 from station.core.depth_image import Image, inverse_depth, jumps
-from station.core.kinect_v1 import RANDOM_SIGMA, ROUNDING, SQUARE_ERROR
+from station.core.kinect_v1 import FROZEN_SHARE, RANDOM_SIGMA, ROUNDING, SQUARE_ERROR
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 
@@ -28,7 +30,7 @@ _HEIGHT_M = (0.15, 3.5)
 _INCIDENCE_COSINE = 0.26
 """75 degrees: a camera at hip height sees the floor at a slant, if at all."""
 _UNEVEN_FLOOR_M, _UNEVEN_BOARD_M = 5e-4, 2e-4
-"""Unevenness of floors and of boards, rms (DIN 18202 lets a finished floor be off
+"""Unevenness of a floor and of a board, rms (DIN 18202 lets a finished floor be off
 by 2 mm over 0.1 m), ..."""
 _BUMP_M2 = 2.0 * np.pi * 0.1**2
 """... in bumps of this size: what one camera sees of a bump errs all alike."""
@@ -40,7 +42,7 @@ _FARTHEST_M = 3.2
 _WHOLE_PX = 3
 _LEAST_WHOLE = 2
 _LEAST_WHOLE_SHARE = 0.6
-"""Least share of frames without a gap: with more gaps, the readings between them are too near."""
+"""Least share of the frames without gaps: else readings between gaps are too near as well."""
 
 
 def observe_floor(
@@ -65,6 +67,11 @@ def observe_wall(
     depth_m, count = _whole_mean(stack, scale_m)
     only = inverse_depth(depth_m) > inverse_depth(background_m) + _FOREGROUND
     return _observe(depth_m, count, camera, surface, axis=2, only=only)
+
+
+def mean_share(frames: Any) -> Any:
+    """Variance of the mean of frames of a still scene, relative to that of one frame."""
+    return FROZEN_SHARE + (1.0 - FROZEN_SHARE) / frames
 
 
 def _whole_mean(stack: NDArray[np.uint16], scale_m: float) -> tuple[Image, Image]:
@@ -162,7 +169,8 @@ def _patches(
 
     w = mean(inverse[v, u])
     slant = mean(cosine[v, u])
-    noise = mean((SQUARE_ERROR / cosine[v, u] + ROUNDING) / count[v, u]) / size[kept]
+    single = (SQUARE_ERROR / cosine[v, u] + ROUNDING) * mean_share(count[v, u])
+    noise = mean(single) / size[kept]
     cells_m2 = size[kept] / (camera.K[0, 0] * camera.K[1, 1] * w**2 * slant)
     alike = np.maximum(_BUMP_M2 / cells_m2, 1.0)
     # What stands out of a surface by h changes the depth along a ray by h / cosine.

@@ -1,4 +1,4 @@
-"""One camera's view of the empty booth: the floor and whatever always stands there.
+"""The view of the empty booth: the floor and everything fixed.
 
 Kept with each calibration. The drift check compares later frames with it, and the ball is looked
 for in front of it. Everything is in inverse depth, in which a structured-light sensor's noise is
@@ -39,7 +39,7 @@ class StaticView:
     noise: Image
     """Standard deviation over time of one frame's smoothed surface (see ``smoothed``), 1/m."""
     outline_noise: Image
-    """The same of its inverse depth with 0 for no reading, as outlines are compared."""
+    """Standard deviation of the inverse depth with 0 for no reading, as outlines are compared."""
     frames: int
 
     def depth_m(self) -> Image:

@@ -1,3 +1,3 @@
-"""Whether a camera has moved since it was calibrated.
+"""Detection of cameras that have moved since the calibration.
 Calibrating anew belongs to `guide` and `solve`.
 """

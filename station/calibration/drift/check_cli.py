@@ -1,4 +1,4 @@
-"""`station check`: does every camera still stand where it was calibrated? Before a shift."""
+"""`station check`: compares every camera with its calibration, before a shift."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool) -> N
             click.echo(move.words())
             if not move.lost and move.unseen():
                 click.echo(
-                    f"  this booth shows it no small move {', '.join(move.unseen_words())}: "
-                    "a fixed post or corner in its view would"
+                    f"  this view cannot detect a small {', '.join(move.unseen_words())}; "
+                    "a fixed post or corner in its view would make it possible"
                 )
     changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
     if changed and not as_json:

@@ -1,4 +1,4 @@
-"""Has a camera moved since it was calibrated? From what it sees of the floor and fixed structure.
+"""A camera's displacement since its calibration, from the floor and fixed structure in view.
 
 The image of inverse depth is aligned with the stored one over the camera's six degrees of freedom:
 the range flow constraint (Horn & Harris 1991, "Rigid body motion from range image sequences")
@@ -39,7 +39,7 @@ _CERTAINTY = 5.2
 cameras that each see two directions badly, and a direction that is seen badly errs by up to one
 standard deviation on the average, for a person hides other places in every scan."""
 _GUARD_M = 0.001
-"""Nothing smaller alarms however certain it is: warmth, the sensor's own steps."""
+"""Smaller displacements never alarm: warmth and the sensor's own steps cause them."""
 _POWER = 2.0
 """A move is surely noticed so many standard deviations beyond what alarms."""
 _STRIDE_PX = 8
@@ -47,7 +47,7 @@ _STRIDE_PX = 8
 _CORRELATION = 2.5
 """... their variances sum to this much more, of a blur of 3.4 px (the sensor's window, ours)."""
 _FLOOR_PER_M = 2e-5
-"""Noise that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
+"""Error that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
 _WIDE_PX = 10.0
 """Slopes of smooth surfaces are taken over this width: noise in them would pass for structure."""
 _EDGE_PER_M_PX = 0.008
@@ -73,7 +73,7 @@ _HUBER, _TUKEY = 1.345, 4.685
 
 @dataclass(frozen=True, slots=True)
 class CameraMove:
-    """The motion of a camera since its calibration, estimated from its background."""
+    """A camera's displacement from its calibration, estimated from the background."""
 
     camera: str
     xi: Array
@@ -108,7 +108,7 @@ class CameraMove:
         return list(directions.T[hidden])
 
     def words(self) -> str:
-        """One sentence for the operator."""
+        """The result for the operator, in one sentence."""
         if self.lost:
             return (
                 f"camera {self.camera} no longer sees what it saw when it was calibrated "
@@ -141,8 +141,8 @@ def _limits(sigmas: Array) -> Array:
 
 
 _MOTIONS = (
-    "nodding", "turning left or right", "tilting",
-    "sideways", "up or down", "forward or back",
+    "pitch", "yaw", "roll",
+    "sideways shift", "vertical shift", "shift forward or back",
 )  # fmt: skip
 _SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
 
@@ -297,7 +297,7 @@ def _align(
 
 
 def _weights(off: Array, convex: bool) -> Array:
-    """Weights of deviations in standard deviations: Huber's first, then Tukey's.
+    """Weights of deviations (in standard deviations): Huber's first, then Tukey's.
 
     Few samples see some directions (the floor: up and down); what most of them call an outlier at
     the start may be what they tell.
@@ -319,7 +319,7 @@ def _changed(reference: DriftReference, now: tuple[Image, Image], xi: Array) -> 
 def _off(
     reference: DriftReference, now: tuple[Image, Image], xi: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """By how much the images differ from what is expected had the camera moved by xi, (r, c).
+    """Differences (r, c) of the images from those expected after a displacement xi.
 
     The stored samples are looked for where they are now (Baker & Matthews 2004, "Lucas-Kanade 20
     years on": inverse compositional), so their sensitivities hold for any xi. Also tells which of

@@ -1,4 +1,4 @@
-"""Every scan checks the cameras: its background against what was stored at the calibration."""
+"""Check of the cameras with every scan: its background against the calibration's empty booth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from station.core.rig import CameraCalibration
 
 
 class DriftWatch:
-    """Knows the empty booth of the calibration in use, and follows when another is put into use."""
+    """The check against the calibration in use; it reloads when another is put into use."""
 
     def __init__(self, store: CalibrationStore, log: logging.Logger) -> None:
         self._store, self._log = store, log
@@ -27,7 +27,7 @@ class DriftWatch:
     def moves(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
     ) -> list[CameraMove]:
-        """Motion of a camera by frames of one moment; empty if no background was stored.
+        """The camera's displacement from frames of one moment; empty where nothing was stored.
 
         Raises:
             CalibrationError: the camera's images are of another size than when it was calibrated.

@@ -1,3 +1,3 @@
-"""The guided calibration: frames, steps, the operator's screen, and the session on disk.
+"""The guided procedure of a calibration: frames, steps, records on disk.
 The mathematics is in `detect` and `solve`.
 """

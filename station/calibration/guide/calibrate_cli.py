@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from station.calibration.detect.board import Board, BoardView, check_ties, find_board, judge_lens
+from station.calibration.detect.detections import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
-from station.calibration.guide.session import FRONT, MARK, Lens, Session
+from station.calibration.guide.session import Lens, Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.commands import config_option
 from station.core.config import find_config, load_config
@@ -155,6 +156,28 @@ def around(procedure: Procedure) -> None:
       station calibrate around
     """
     procedure.around(asked=False)
+
+
+@calibrate.command("stand")
+@click.option(
+    "--height",
+    "height_m",
+    type=click.FloatRange(0.3, 2.2),
+    required=True,
+    help="of the ball's underside above the floor, metres, measured to 1 mm",
+)
+@_options
+def stand(procedure: Procedure, height_m: float) -> None:
+    """Look at the ball on a stand of measured height on the mark: the scale of all heights.
+
+    Two heights are best: one that all cameras see, and one as high as a head.
+
+    \b
+    Examples:
+      station calibrate stand --height 0.9
+      station calibrate stand --height 1.7
+    """
+    procedure.stand(height_m)
 
 
 @calibrate.command("depth")

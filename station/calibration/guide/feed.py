@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from station.calibration.detect.detections import uncalibrated
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
+from station.core.kinect_v1 import NO_READING, TABLE
 from station.core.rig import CameraCalibration
 from station.core.service import die_with_parent
 from station.messaging.intake import FrameIntake, LiveFrame
@@ -32,11 +33,11 @@ from station.messaging.topics import TOPICS
 from station.messaging.transport import ask, publisher
 from station.sensors.base import DeviceInfo
 from station.sensors.clock import DeviceClock
-from station.sensors.recording import check_recording
+from station.sensors.recording import check_recording, read_raw
 
 _POLL_S = 0.05
 _LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
-"""Most frames that wait to be taken; each is 0.6 MB."""
+"""Frames that may wait; each is 0.6 MB."""
 _STOP_S = 5.0
 _GATHER_S = 20.0
 
@@ -52,9 +53,20 @@ class TimedFrame:
     scale_m: float
     clock_resets: int = 0
     """Number of resets of the camera's clock so far."""
+    file: Path | None = None
+    """The frame in its recording, where it is replayed."""
 
     def depth_m(self) -> NDArray[np.float32]:
-        return self.depth.astype(np.float32) * np.float32(self.scale_m)
+        depth = self.depth
+        if not depth.size and self.file is not None:
+            depth = TABLE[read_raw(self.file) & NO_READING]
+        return depth.astype(np.float32) * np.float32(self.scale_m)
+
+    def on_disk(self) -> TimedFrame:
+        """The same frame without its pixels, if these can be read again."""
+        if self.file is None:
+            return self
+        return replace(self, depth=np.zeros((0, 0), np.uint16))
 
 
 class RecordedClock:
@@ -67,6 +79,7 @@ class RecordedClock:
     def __init__(self, folder: Path) -> None:
         listed = check_recording(folder)
         self._frames = {ticks: (index, s) for index, (s, ticks, _) in enumerate(listed)}
+        self._files = {ticks: file for _, ticks, file in listed}
         self._last_index = -1
         self._last = len(listed) - 1
         self._clock: DeviceClock | None = None
@@ -74,6 +87,10 @@ class RecordedClock:
         """It has been seen once; from here on it starts over."""
         self.missed = 0
         """Frames of it that did not come, so far."""
+
+    def file(self, header: FrameHeader) -> Path | None:
+        """The file of a frame."""
+        return self._files.get(header.device_ticks)
 
     def time_s(self, header: FrameHeader) -> float | None:
         """Time at which a frame was taken; None when the recording has begun anew."""
@@ -124,7 +141,7 @@ class Feed:
 
     @property
     def replays(self) -> bool:
-        """Whether these are recordings, not live cameras."""
+        """True for recordings, false for live cameras."""
         return bool(self._clocks)
 
     @property
@@ -229,7 +246,8 @@ class Feed:
             return None
         # Replays have the clocks of their recordings, whatever becomes of the replay's.
         resets = header.clock_resets if clock is None else 0
-        return TimedFrame(header.camera, time_s, live.depth, header.depth_scale_m, resets)
+        file = None if clock is None else clock.file(header)
+        return TimedFrame(header.camera, time_s, live.depth, header.depth_scale_m, resets, file)
 
     def _wish(self) -> None:
         """Capture processes of a replay have no control that tells them to stream."""

@@ -1,4 +1,4 @@
-"""Looks for the ball in frames as they come, beside whoever receives them."""
+"""Ball detection in threads beside the process that receives the frames."""
 
 from __future__ import annotations
 
@@ -54,7 +54,14 @@ class BallFinder:
                 # What is near the beat keeps it: of 30 frames a second 20 are looked at, not 15.
                 beat_s = due_s if abs(late_s) < _NEAR_S else frame.time_s
                 self._due_s[frame.camera] = beat_s + _APART_S
-                self._pending.append(self._pool.submit(self._find, frame))
+                # A replay may be a minute ahead of the search: its frames wait on disk.
+                waiting = frame if len(self._pending) < _WAITING else frame.on_disk()
+                self._pending.append(self._pool.submit(self._find, waiting))
+
+    @property
+    def waiting(self) -> int:
+        """Frames that have not been looked at yet."""
+        return len(self._pending)
 
     def found(self, *, wait: bool = False) -> list[BallDetection]:
         """Detections since the last call, in the order of the frames."""

@@ -1,4 +1,4 @@
-"""Screen, sounds and keys of the operator of a calibration, who may be alone in the booth."""
+"""The terminal of a calibration's operator, who may be alone in the booth."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ _BELL = "\a"
 _LAST_SECONDS = 3
 _LINE_EVERY_S = 5.0
 _WIDTH = 100
+_HEIGHT = click.FloatRange(0.0, 2.2)
+"""Metres: within sight of a booth's cameras."""
 
 
 @dataclass(slots=True)
 class Guide:
-    """The terminal. Unattended (recordings, scripts) nothing is waited for."""
+    """Prompts, progress and sounds. Unattended (recordings, scripts) nothing is waited for."""
 
     attended: bool
     countdown_s: float
@@ -24,7 +26,7 @@ class Guide:
     _open_line: bool = False
 
     def step(self, title: str, instruction: str) -> None:
-        """Say what comes; wait until the operator is ready and in place."""
+        """Announce a step; wait until the operator is ready and in place."""
         self.title(title)
         click.echo(f"  {instruction}")
         if not self.attended:
@@ -40,7 +42,7 @@ class Guide:
         self.progress(f"now{_BELL}", now=True)
 
     def title(self, text: str) -> None:
-        """Announce a step."""
+        """Print the title of what begins now."""
         self.end_line()
         click.echo(f"\n{text}")
 
@@ -64,12 +66,25 @@ class Guide:
         self.say(f"{text}{_BELL if self.attended else ''}")
 
     def another(self, question: str) -> bool:
-        """Whether the operator wants one more; never when nobody is there."""
+        """Ask whether the operator wants one more; no when nobody is there."""
         self.end_line()
         return self.attended and click.confirm(f"  {question}", default=True)
 
+    def height_m(self) -> float | None:
+        """The measured height of a stand, metres; None when there is none or nobody to ask."""
+        self.end_line()
+        if not self.attended:
+            return None
+        answer = click.prompt(
+            "  A ball on a stand of measured height makes heights more certain. Height of its "
+            "underside above the floor in metres (0: no stand)",
+            type=_HEIGHT,
+            default=0.0,
+        )
+        return float(answer) or None
+
     def end_line(self) -> None:
-        """End the current line, so that the next text begins on its own."""
+        """End the progress line."""
         if self._open_line:
             click.echo()
             self._open_line = False

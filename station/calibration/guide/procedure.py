@@ -1,4 +1,4 @@
-"""The calibration procedure, step by step, up to the solution in use."""
+"""The steps of a calibration in their order, up to the solution in use."""
 
 from __future__ import annotations
 
@@ -8,18 +8,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from station.calibration.detect.detections import AROUND, BALL, EMPTY, FRONT, MARK, STAND, WALL
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.session import (
-    AROUND,
-    BALL,
-    EMPTY,
-    FRONT,
-    MARK,
-    SESSION,
-    WALL,
-    Session,
-)
+from station.calibration.guide.session import SESSION, Session
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
     covered,
@@ -35,7 +27,7 @@ from station.core.errors import CalibrationError
 _SENSORS_S = 20.0
 _MOST_BOARDS, _MOST_PLACES = 20, 20
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
-"""Places of the ball: three that are not on one line show the floor's slope in both directions."""
+"""Places of the ball: three that are not on one line show the floor's slope both ways."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +76,9 @@ class Procedure:
         recorded_front = self.recordings is not None and (self.recordings / FRONT).is_dir()
         if recorded_front and (session is None or not session.done(FRONT)):
             self.rest(FRONT)
-        if session is None or len(session.around) < len(_AROUND):
+        if session is None or session.around_count < len(_AROUND):
             self.around(asked=True)
+        self.stands()
         if session is None or not session.done(WALL):
             self.walls(asked=True)
         self.solve()
@@ -122,7 +115,7 @@ class Procedure:
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
         session = self.begun()
-        before = len(session.around) if session and self.recordings is None else 0
+        before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MOST_PLACES):
             step = f"{AROUND}-{place}"
             if self.recordings is not None:
@@ -135,6 +128,20 @@ class Procedure:
             where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
             exactly = ", 0.6 m away, where a lower camera sees it"
             self._lay(step, f"on the floor {where}", exactly)
+
+    def stands(self) -> None:
+        """The ball on a stand at as many heights as the operator (or the recordings) likes."""
+        if self.recordings is not None:
+            for folder in sorted(self.recordings.glob(f"{STAND}-*")):
+                self.stand(1e-3 * float(folder.name.removeprefix(f"{STAND}-")))
+            return
+        while (height_m := self.guide.height_m()) is not None:
+            self.stand(height_m)
+
+    def stand(self, height_m: float) -> None:
+        """The ball on a stand, its underside at a measured height above the floor."""
+        where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
+        self._lay(f"{STAND}-{round(1e3 * height_m)}", where)
 
     def walls(self, asked: bool) -> None:
         """The flat board at as many places as the operator (or the recordings) likes."""
@@ -160,6 +167,7 @@ class Procedure:
 
     def solve(self) -> None:
         """The solution from what was seen, put into use."""
+        from station.calibration.solve.refusals import Limits
         from station.calibration.solve.solution import solve
 
         session = self.session()
@@ -173,6 +181,9 @@ class Procedure:
             front_cameras=self.config.front_cameras,
             created=_now(),
             progress=self.guide.progress,
+            limits=Limits(
+                self.config.calibrate.height_limit_m, self.config.calibrate.girth_limit_m
+            ),
         )
         for line in solution.summary():
             self.guide.say(line)

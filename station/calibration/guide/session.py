@@ -17,7 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
+from station.calibration.detect.detections import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    MARK,
+    STAND,
+    WALL,
+    BallDetection,
+    Observations,
+    PlaneObservation,
+)
 from station.calibration.detect.scene import StaticView
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import fsync_folder, private_folder, read_json, write_json
@@ -28,8 +39,6 @@ VERSIONS = frozenset({1})
 SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
-EMPTY, BALL, MARK, FRONT, WALL = "empty", "ball", "mark", "front", "wall"
-AROUND = "around"
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
@@ -127,7 +136,7 @@ class Session:
         return Observations(self.balls, self.mark, self.front, planes, self.around)
 
     def done(self, step: str) -> bool:
-        """Whether a step has been finished (waving never is: more of it always helps)."""
+        """True once a step is finished (waving never is: more of it always helps)."""
         if step in (MARK, FRONT):
             return bool(getattr(self, step))
         if step == WALL:
@@ -135,13 +144,16 @@ class Session:
         return step in self.planes
 
     def summary(self) -> str:
-        """The session so far, in words."""
+        """Summary of the observations so far, for the operator."""
         parts = {
             "the empty booth": self.done(EMPTY),
             f"{len(self.balls)} sightings of the waved ball": bool(self.balls),
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
-            f"{len(self.around)} places around it": bool(self.around),
+            f"{self.around_count} places around it": bool(self.around_count),
+            f"{len(self.around) - self.around_count} heights of the stand": (
+                len(self.around) > self.around_count
+            ),
             f"{self.wall_count} boards": self.done(WALL),
         }
         return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
@@ -160,6 +172,11 @@ class Session:
         self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
 
     @property
+    def around_count(self) -> int:
+        """Places on the floor around the mark at which the ball was seen."""
+        return sum(place.startswith(AROUND) for place in self.around)
+
+    @property
     def wall_count(self) -> int:
         return sum(name.startswith(WALL) for name in self.planes)
 
@@ -172,7 +189,7 @@ class Session:
         self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
 
     def begin_run(self) -> None:
-        """From here on the ball is waved again; its times have nothing to do with those before."""
+        """Start another run of waving, whose times are unrelated to those before."""
         self._append({"step": "run"})
 
     def keep_balls(self, balls: Sequence[BallDetection]) -> None:
@@ -236,7 +253,7 @@ class Session:
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
-        elif step.startswith(AROUND):
+        elif step.startswith((AROUND, STAND)):
             self.around[step] = [BallDetection.from_json(ball) for ball in entry["balls"]]
         elif step == "board":
             for name, lens in entry["lenses"].items():
@@ -247,7 +264,7 @@ class Session:
             self.planes[step] = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
 
     def _moved_by(self, first_s: float) -> float:
-        """By what a run's times are moved, so that it follows the runs before."""
+        """Shift of a run's times that puts it after the runs before."""
         if self._later_s is None:
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0

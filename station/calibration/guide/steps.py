@@ -18,7 +18,7 @@ from station.calibration.guide.session import Session
 from station.core.depth_image import Image
 from station.core.errors import CalibrationError
 
-EMPTY_FIRST = "the empty booth has to be looked at first: station calibrate floor"
+EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
 _EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
@@ -28,6 +28,7 @@ _RESTING_M = 0.006
 _OTHERS_S = 3.0
 """After the first camera others have so long to see it at rest, too."""
 _WRITE_EVERY_S = 1.0
+_LOOK_EVERY_S = 0.2
 _OFTEN = 0.9
 _MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
@@ -149,7 +150,7 @@ def _at_rest(seen: list[BallDetection]) -> bool:
 
 
 def covered(session: Session, reference: str) -> Coverage:
-    """Coverage by the waved ball so far."""
+    """Coverage of the booth by the waved ball so far."""
     coverage = Coverage(session.lensed_cameras(), reference)
     for ball in session.balls:
         coverage.add(ball)
@@ -199,7 +200,11 @@ def wave_ball(
                 guide.progress(_wave_line(coverage, left_s))
                 if not feed.replays and left_s < (0.0 if coverage.enough else -lasts_s):
                     break
-            keep(finder.found(wait=True))
+            while finder.waiting:
+                keep(finder.found())
+                write()
+                guide.progress(f"looking for the ball in {finder.waiting} more frames")
+                time.sleep(_LOOK_EVERY_S)
         except KeyboardInterrupt:
             guide.say("stopped; what was seen is kept")
         finally:

@@ -61,7 +61,7 @@ class CalibrationStore:
 
     @property
     def unfinished(self) -> Path:
-        """Folder of the session of the unfinished calibration."""
+        """Folder of the unfinished calibration."""
         return self.folder / UNFINISHED
 
     def entries(self) -> list[Entry]:

@@ -1,4 +1,4 @@
-"""Whether a calibration holds on detections that it was not solved from, in millimetres.
+"""The test of a calibration on detections that it was not solved from, in millimetres.
 
 Every fifth second is held out. What a camera saw then is compared with where the other cameras saw
 the ball, through the poses and corrections of the rest of the time.
@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.solve.joint import local_equations
+from station.calibration.adjust.equations import recentred
+from station.calibration.adjust.problem import Problem, Sightings, State
 from station.calibration.solve.pairwise import Track
-from station.calibration.solve.problem import Problem, Sightings, State
 from station.core.geometry import transform
+from station.core.rig import PredictedError
 
 Array = NDArray[np.float64]
 
@@ -25,13 +26,15 @@ LARGEST_RMS_M = 0.006
 """Largest rms of single detections, whose own noise is 1-2 mm."""
 LARGEST_MEAN_M = 0.0025
 """Largest mean of a camera's held-out detections, in which the noise averages out."""
+_A_SECOND = 10.0
+"""Detections of a held-out second, which share the errors of one region."""
 _LEAST = 6
 """Fewer comparisons prove nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Distances of one camera's held-out detections from the ball as the others saw it."""
+    """Differences of one camera's held-out detections from where the others saw the ball."""
 
     detections: int
     rms_m: float
@@ -66,9 +69,7 @@ def without_held_out(problem: Problem) -> Problem:
 def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
     """Each camera's held-out detections against the other cameras', by a state solved without."""
     start_s = _start(problem)
-    tracks = {
-        name: corrected(seen, state, problem.radius_m) for name, seen in problem.waved.items()
-    }
+    tracks = {name: corrected(seen, problem, state) for name, seen in problem.waved.items()}
     found = {}
     for name, track in tracks.items():
         chosen = held_out(problem.waved[name].times_s, start_s)
@@ -83,11 +84,36 @@ def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
 
 
 def overall_rms(found: Mapping[str, HeldOut]) -> float:
-    """Rms distance over all cameras' held-out detections."""
+    """Rms over all cameras' held-out detections."""
     count = sum(one.detections for one in found.values())
     return float(
         np.sqrt(sum(one.detections * one.rms_m**2 for one in found.values()) / max(count, 1))
     )
+
+
+def inflated(predicted: PredictedError, found: Mapping[str, HeldOut]) -> PredictedError:
+    """Predicted errors widened by what the held-out test shows beyond its own noise.
+
+    A camera's mean offset against the others has the variance rms^2 / n of its own; what exceeds
+    it, along one axis and shared by two cameras, is an error that the covariance does not know.
+    """
+    excess = [
+        (float(one.mean_m @ one.mean_m) - one.rms_m**2 / _independent(one)) / 6.0
+        for one in found.values()
+    ]
+    unknown_m2 = max(0.0, float(np.mean(excess)))
+    factor = float(np.sqrt(1.0 + unknown_m2 / predicted.normal_rms_m**2))
+    return PredictedError(
+        factor * predicted.height_sigma_m,
+        factor * predicted.girth_sigma_m,
+        factor * predicted.normal_rms_m,
+        predicted.tilt_sigma_rad,
+    )
+
+
+def _independent(one: HeldOut) -> float:
+    """Number of held-out detections that err independently, one a second at most."""
+    return max(1.0, one.detections / _A_SECOND)
 
 
 def _start(problem: Problem) -> float:
@@ -107,15 +133,13 @@ def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -
     return points[seen] - total[seen] / count[seen, None]
 
 
-def corrected(seen: Sightings, state: State, radius_m: float) -> Track:
+def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
     """Detections in the reference frame after depth correction and clock offset."""
-    centers = seen.centers.copy()
-    for _ in range(4):
-        normal, pull = local_equations(seen, centers, state.corrections[seen.camera], radius_m)
-        centers -= np.linalg.solve(normal[:, :3, :3], pull[:, :3, None])[..., 0]
-    return Track(
-        seen.times_s + state.clock_s[seen.camera], transform(state.poses[seen.camera], centers)
+    name = seen.camera
+    centers = recentred(
+        seen, problem.cameras[name], problem.model, state.sensors[name], state.radius_m
     )
+    return Track(seen.times_s + state.clock_s[name], transform(state.poses[name], centers))
 
 
 def _typical(away: Array) -> float:

@@ -1,4 +1,4 @@
-"""Whether cameras kept their clocks and places all the way through a calibration.
+"""Detection of clocks and cameras that jumped during a calibration.
 
 A clock that is reset midway puts all later detections at wrong times: as wrong as the ball is fast.
 A camera that is bumped puts them at wrong places.
@@ -22,14 +22,14 @@ _WINDOW_S = 4.0
 _LEAST_IN_WINDOW_S = 0.8
 _LONGEST_SHIFT_S = 3.0
 _SHORTEST_SHIFT_S = 0.15
-"""In that time the ball goes farther than depth errors reach: shorter jumps are told from them only
+"""In this time the ball travels farther than depth errors reach: shorter jumps are found only
 once these are corrected, by ``small_jump``."""
 _SHIFT_STEP_S = 0.03
 _ONE_JUMP_S = 0.15
 """Windows after one jump ask for the same shift to within this."""
 _AGREEING = 0.6
 _GAIN = 0.3
-"""By how much more of a window's matches must agree once a clock is shifted."""
+"""Least gain in the share of agreeing matches once a clock is shifted."""
 _CUT_STEP_S = 2.0
 _LEAST_ON_A_SIDE_S = 2.5
 _COUNTED_S = 0.1
@@ -117,7 +117,7 @@ def moved_camera(tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pa
 def _stands_elsewhere(
     tracks: Mapping[str, Track], drops: Mapping[tuple[str, str], float], cut_s: float
 ) -> bool:
-    """Whether pairs agree by themselves on the side of the cut on which they agree less."""
+    """True if pairs agree by themselves on the side of the cut on which they agree less."""
     shares = []
     for (a, b), drop in drops.items():
         late = tracks[a].times_s >= cut_s
@@ -133,7 +133,7 @@ def _seen_s(times_s: Array) -> float:
 
 
 def _window_shifts(a: Track, b: Track, pair: Pair) -> list[tuple[float, bool]]:
-    """By how much b's clock is late in each window in which the pair does not agree otherwise, and
+    """Lateness of b's clock in each window in which the pair does not agree otherwise, and
     whether they see the ball together there: where they hardly do, slow balls fit many shifts."""
     later = np.arange(_SHORTEST_SHIFT_S, _LONGEST_SHIFT_S + 1e-9, _SHIFT_STEP_S)
     shifts = np.concatenate([-later[::-1], later])
@@ -180,7 +180,7 @@ def _lateness(a: Track, b: Track) -> tuple[Array, Array, Array]:
 
 
 def _step(measured: tuple[Array, Array, Array], cut_s: float) -> tuple[float, float] | None:
-    """Step of the clock at the cut, and its standard deviation."""
+    """Change of the lateness at the cut, and its standard deviation."""
     times, pulled, known = measured
     early = times < cut_s
     if min(_seen_s(times[side]) for side in (early, ~early)) < _LEAST_ON_A_SIDE_S:

@@ -1,4 +1,4 @@
-"""Poses of the cameras relative to the reference, from pairs that saw the ball at one time.
+"""First poses relative to the reference camera, from pairs that saw the ball at one time.
 
 Closed form over three matches, RANSAC over all of them, then the pairs are chained to the reference
 along the tree of most agreement. Good to a few centimetres: the depth errors are not known yet.
@@ -51,7 +51,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The relative pose of two cameras."""
+    """The relation of two cameras and the matches that agree with it."""
 
     a_from_b: Array
     times_s: Array

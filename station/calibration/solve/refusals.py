@@ -1,41 +1,51 @@
-"""Refusals of a calibration, and the operator's messages: the cause and the remedy."""
+"""Reasons to refuse a calibration, each with its cause and remedy for the operator."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.normal import MEDIAN
+from station.calibration.adjust.problem import State
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, Observations
-from station.calibration.solve import clocks, world
+from station.calibration.solve import clocks
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections
-from station.calibration.solve.joint import MEDIAN
 from station.calibration.solve.pairwise import Pair
-from station.calibration.solve.problem import State
 from station.calibration.solve.world import Placed
 from station.core.errors import CalibrationError
+from station.core.rig import PredictedError
 
 Array = NDArray[np.float64]
 
 _RADIUS_SHARE = 0.04
-"""Largest relative error of the measured radius; a depth error of 1 % changes it by 1 %."""
+"""Largest deviation of the measured radius; a depth error of 1 % changes it by 1 %."""
 _LEAST_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
-_LARGEST_SIGMA_M = 0.002
-_LARGEST_SIGMA_RAD = np.radians(0.1)
 _LARGEST_SCATTER = 3.0
 SETTLED, LOST = 0.3, 10.0
 """Last steps, in standard deviations: beyond the second nobody can tell whose fault it is."""
 _MARK_TOLERANCE_M = 0.008
-_LARGEST_SLOPE_RAD = np.radians(0.1)
-"""A body's head is 3 mm to one side at it."""
+_LARGEST_SLOPE_RAD = np.radians(0.15)
+"""A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
+SIGMAS_95 = 1.96
+STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
 AROUND_WORDS = (
     "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
     "sees it (station calibrate around)"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Largest errors (95 %) that a calibration by itself may add, metres."""
+
+    height_m: float = 0.006
+    girth_m: float = 0.008
 
 
 def check_counts(covered: Coverage) -> None:
@@ -153,14 +163,19 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         )
 
 
-def check_sigma(placed: Placed, reference: str, covered: Coverage) -> None:
-    for name in placed.world_from_camera:
-        shift, turn = world.sigma_to(placed, reference, name)
-        if shift > _LARGEST_SIGMA_M or turn > _LARGEST_SIGMA_RAD:
+def check_predicted(predicted: PredictedError, limits: Limits, covered: Coverage) -> None:
+    """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
+    for what, sigma_m, limit_m in (
+        ("heights", predicted.height_sigma_m, limits.height_m),
+        ("girths", predicted.girth_sigma_m, limits.girth_m),
+    ):
+        if SIGMAS_95 * sigma_m > limit_m:
             more = "" if covered.enough else f"; {covered.advice()}"
             raise CalibrationError(
-                f"camera {name} is known to {1e3 * shift:.1f} mm and {np.degrees(turn):.2f} "
-                f"degrees only: wave the ball longer, near to {name} and far from it{more}"
+                f"by this calibration {what} could be wrong by "
+                f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, and "
+                f"{1e3 * limit_m:.0f} mm are allowed (calibrate.{what[:-1]}_limit_m): "
+                f"{STAND_WORDS}, and wave the ball longer{more}"
             )
 
 

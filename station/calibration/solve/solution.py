@@ -1,6 +1,6 @@
-"""A booth's calibration from what its cameras saw: pairs, then all at once, then the verdict.
+"""A booth's calibration from its observations: pairs, the joint solution, the verdict.
 
-Whatever would make it wrong is refused in the operator's words, with what to do about it.
+Faulty input is refused with its cause and remedy.
 """
 
 from __future__ import annotations
@@ -12,24 +12,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.averaging import averaged, likeliest
+from station.calibration.adjust.joint import solve_joint
+from station.calibration.adjust.problem import Problem, Sightings, State
+from station.calibration.adjust.sensor_model import COARSE, SensorModel
+from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import FLOOR, Observations
+from station.calibration.detect.detections import FLOOR, FRONT, MARK, STAND, Observations
 from station.calibration.solve import acceptance, clocks, refusals, world
 from station.calibration.solve.acceptance import HeldOut
-from station.calibration.solve.depth_correction import correction_of
 from station.calibration.solve.initial import (
     Detections,
     at_rest,
     confirmed,
+    continued,
     first_state,
     named_surfaces,
     resting_places,
     sorted_detections,
     spread_m,
+    with_bow,
 )
-from station.calibration.solve.joint import solve_joint
 from station.calibration.solve.pairwise import chain, relate_all
-from station.calibration.solve.problem import Problem, Sightings, State
+from station.calibration.solve.predicted import predict
+from station.calibration.solve.refusals import Limits
 from station.calibration.solve.world import Placed
 from station.core.errors import CalibrationError
 from station.core.rig import CameraCalibration, Rig
@@ -38,7 +44,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _LEAST_SPREAD_M = 0.15
-"""Least distance of the ball's places from one line, when no camera sees the floor."""
+"""Least rms distance of the resting ball's places from one line, where no camera sees the floor."""
+_FINE_ITERATIONS = 16
 _GOOD_SLOPE_RAD = np.radians(0.06)
 
 
@@ -51,7 +58,7 @@ class Solution:
     """Poses with the covariance between cameras."""
     held_out: Mapping[str, HeldOut]
     weak: tuple[str, ...]
-    """Possible improvements, in words; may be empty."""
+    """Advice on what could be better; empty where there is none."""
     clock_s: Mapping[str, float]
     """Offset of each camera's clock against the reference's."""
     radius_m: float
@@ -70,6 +77,12 @@ class Solution:
             )
             off_mm = 1e3 * float(np.linalg.norm(one.mean_m))
             lines.append(f"{name}: {known}; off by {off_mm:.1f} mm in {one.detections} tests")
+        if self.rig.predicted is not None:
+            lines.append(
+                "from the calibration alone, heights are right to "
+                f"{2e3 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
+                f"{2e3 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
+            )
         slope_deg = np.degrees(self.placed.slope_sigma_rad)
         lines.append(f"the floor's slope is known to {slope_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
@@ -110,6 +123,7 @@ def solve(
     front_cameras: Sequence[str],
     created: str,
     progress: Progress = lambda _: None,
+    limits: Limits = Limits(),  # noqa: B008  # frozen
 ) -> Solution:
     """The calibration that agrees best with all that was seen.
 
@@ -137,37 +151,52 @@ def solve(
 
     problem = _problem(observations, cameras, detections, poses, radius_m, reference)
     progress("solving without every fifth second")
-    training = acceptance.without_held_out(problem)
-    tested = solve_joint(training, first_state(training, poses))
+    training, tested, found = _tested(problem, poses)
+
+    progress("solving with all that was seen")
+    problem = replace(problem, widths=likeliest(training, tested))
+    start = continued(problem, training, tested)
+    state = solve_joint(problem, start, _FINE_ITERATIONS)
+    refusals.check_settled(state)
+    state = averaged(problem, state)
+    placed = world.place(problem, state, front_cameras)
+    refusals.check_upright(placed)
+    refusals.check_slope(placed)
+    refusals.check_mark(placed, radius_m)
+    rig = _rig(problem, placed, state, created, acceptance.overall_rms(found))
+    predicted = acceptance.inflated(predict(problem, state, placed, rig.cameras), found)
+    refusals.check_predicted(predicted, limits, covered)
+    rig = replace(rig, predicted=predicted)
+    weak = [] if covered.enough else [covered.advice()]
+    if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
+        weak.append(f"for heights, {refusals.STAND_WORDS}")
+    if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
+        weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
+    return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)
+
+
+def _tested(
+    problem: Problem, poses: Mapping[str, Array]
+) -> tuple[Problem, State, dict[str, HeldOut]]:
+    """The problem without the held-out seconds, its solution, and how that does in them."""
+    training = acceptance.without_held_out(replace(problem, model=COARSE))
+    coarse = solve_joint(training, first_state(training, poses), informed=False)
+    refusals.check_settled(coarse, refusals.LOST)
+    training = replace(training, model=problem.model)
+    tested = solve_joint(training, _refined(coarse, COARSE, problem.model), _FINE_ITERATIONS)
     refusals.check_settled(tested, refusals.LOST)
     found = acceptance.compare(problem, tested)
     refusals.check_clocks(
         clocks.small_jump(
             {
-                name: acceptance.corrected(seen, tested, radius_m)
+                name: acceptance.corrected(seen, training, tested)
                 for name, seen in training.waved.items()
             }
         )
     )
     refusals.check_scatter(tested)
     refusals.check_held_out(found)
-
-    progress("solving with all that was seen")
-    start = first_state(problem, tested.poses)
-    state = solve_joint(
-        problem, replace(start, corrections=tested.corrections, clock_s=tested.clock_s)
-    )
-    refusals.check_settled(state)
-    placed = world.place(problem, state, front_cameras)
-    refusals.check_sigma(placed, reference, covered)
-    refusals.check_slope(placed)
-    refusals.check_upright(placed)
-    refusals.check_mark(placed, radius_m)
-    rig = _rig(cameras, placed, state, reference, created, acceptance.overall_rms(found))
-    weak = [] if covered.enough else [covered.advice()]
-    if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
-        weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
-    return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)
+    return training, tested, found
 
 
 def _problem(
@@ -187,43 +216,51 @@ def _problem(
         for name, camera in cameras.items()
     }
     resting: dict[str, list[Sightings]] = {}
-    places = {world.MARK: observations.mark, world.FRONT: observations.front, **observations.around}
+    places = {MARK: observations.mark, FRONT: observations.front, **observations.around}
     for place, seen in places.items():
         views = [at_rest(seen, camera, radius_m) for camera in cameras.values()]
         there = [view for view in views if view is not None]
         if there:
             resting[place] = there
-    if world.MARK not in resting:
+    if MARK not in resting:
         raise CalibrationError(
             "no camera saw the ball rest on the mark; put it there and leave the booth for the "
             "two seconds that this step takes"
         )
+    heights_m = {
+        place: 1e-3 * float(place.removeprefix(f"{STAND}-"))
+        for place in resting
+        if place.startswith(STAND)
+    }
     surfaces = named_surfaces(observations.planes, cameras, poses)
     if not any(surface.surface == FLOOR for surface in surfaces):
-        spread = spread_m(np.array(list(resting_places(resting, poses).values())))
+        laid = {place: seen for place, seen in resting.items() if place not in heights_m}
+        spread = spread_m(np.array(list(resting_places(laid, poses).values())))
         if spread < _LEAST_SPREAD_M:
             raise CalibrationError(
                 "no camera saw enough of the floor, and the ball did not lie on it at three "
                 f"places away from one line: {refusals.AROUND_WORDS}"
             )
-    return Problem(cameras, reference, radius_m, waved, resting, surfaces)
+    problem = Problem(
+        cameras, reference, radius_m, waved, resting, surfaces, Widths.widest(cameras), heights_m
+    )
+    return with_bow(problem, poses)
 
 
-def _rig(
-    cameras: Mapping[str, CameraCalibration],
-    placed: Placed,
-    state: State,
-    reference: str,
-    created: str,
-    rms_m: float,
-) -> Rig:
+def _refined(state: State, coarse: SensorModel, fine: SensorModel) -> State:
+    """The state with the parameters that a finer model adds at zero."""
+    sensors = {name: coarse.expanded(own, fine) for name, own in state.sensors.items()}
+    return replace(state, sensors=sensors)
+
+
+def _rig(problem: Problem, placed: Placed, state: State, created: str, rms_m: float) -> Rig:
     solved = {}
-    for i, (name, camera) in enumerate(cameras.items()):
+    for i, (name, camera) in enumerate(problem.cameras.items()):
         own = np.s_[6 * i : 6 * i + 6]
         solved[name] = replace(
-            camera,
-            depth_correction=correction_of(state.corrections[name]),
+            problem.model.camera(camera, state.sensors[name]),
+            depth_correction=problem.model.correction(state.sensors[name]),
             world_from_camera=placed.world_from_camera[name],
             covariance=placed.covariance[own, own],
         )
-    return Rig(created, reference, solved, rms_m)
+    return Rig(created, problem.reference, solved, rms_m)

@@ -1,4 +1,4 @@
-"""From the reference camera's frame to the booth's: z up from the floor, origin on the mark.
+"""The transform from the reference camera to the booth: z up from the floor, origin on the mark.
 
 The subject faces -y: towards where the ball rested in front of the mark, or else towards the middle
 of the front cameras.
@@ -7,18 +7,16 @@ of the front cameras.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.detections import FLOOR
-from station.calibration.solve.problem import Layout, Problem, State, moved_state
+from station.calibration.adjust.problem import Layout, Problem, State, moved_state
+from station.calibration.detect.detections import FLOOR, FRONT, MARK
 from station.core.geometry import adjoint, invert, rigid, twist_between
 
 Array = NDArray[np.float64]
-
-MARK, FRONT = "mark", "front"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +30,8 @@ class Placed:
     """Height of the resting ball's centre above the floor."""
     slope_sigma_rad: float
     """Largest standard deviation of the floor's slope, as the reference camera sees it."""
+    jacobian: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """(6 n, m): derivatives of all cameras' xi by the border's unknowns."""
 
 
 def world_from_reference(state: State, front_cameras: Sequence[str]) -> Array:
@@ -61,9 +61,9 @@ def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Place
 
     layout = Layout.of(problem)
     here = poses(state)
-    jacobian = np.empty((6 * len(here), layout.size))
+    jacobian = np.zeros((6 * len(here), layout.size))
     sigma = np.sqrt(np.diag(state.covariance))
-    for i in range(layout.size):
+    for i in layout.geometry:
         step = np.zeros(layout.size)
         step[i] = 0.1 * sigma[i]
         ends = [poses(moved_state(problem, layout, state, sign * step)) for sign in (1.0, -1.0)]
@@ -73,6 +73,7 @@ def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Place
         ]
         jacobian[:, i] = np.concatenate(twists) / (0.2 * sigma[i])
     return Placed(
+        jacobian=jacobian,
         world_from_camera=dict(zip(problem.cameras, here, strict=True)),
         covariance=jacobian @ state.covariance @ jacobian.T,
         mark_height_m=_above(state, state.places[MARK]),

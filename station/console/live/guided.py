@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from station.calibration.detect.detections import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
-from station.calibration.guide.session import FRONT, MARK
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import load_config
 from station.core.errors import BoothError
@@ -66,6 +66,10 @@ class PageGuide(Guide):
             return False
         self._say("question", text=question)
         return self._answer() == "yes"
+
+    def height_m(self) -> float | None:
+        """None: the page asks for no numbers; `station calibrate stand` adds a stand."""
+        return None
 
     def end_line(self) -> None:
         """Do nothing: the page has no line that is overwritten."""

@@ -17,8 +17,8 @@ from unittest import mock
 
 import numpy as np
 
-from station.calibration.detect.detections import BallDetection
-from station.calibration.guide.session import EMPTY, FRONT, MARK, Session
+from station.calibration.detect.detections import EMPTY, FRONT, MARK, BallDetection
+from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
 from station.core.errors import FormatError

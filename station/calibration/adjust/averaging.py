@@ -1,0 +1,259 @@
+"""The average over all widths that the priors may have, each weighed by its evidence.
+
+About a solution the squared deviations are quadratic, with information H and gradient b without the
+uncertain priors. For a prior with information L the marginal likelihood of the data is, by
+Laplace, log p = -(least of the quadratic) - log|H + L| / 2 + log|L| / 2 (MacKay 1992): the last two
+terms are Occam's factor, by which what is narrow is preferred unless the data speak against it.
+Means and covariances of all choices are averaged (Hoeting et al. 1999), so that what the evidence
+does not decide shows in the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import logsumexp
+
+from station.calibration.adjust.problem import (
+    Indices,
+    Layout,
+    Problem,
+    State,
+    moved_state,
+    priors,
+)
+from station.calibration.adjust.sensor_model import FIELD
+from station.calibration.adjust.widths import (
+    BOW,
+    BOW_TOLERANCE,
+    CLASSES,
+    FIELD_LEVELS,
+    LEVELS,
+    RADIUS,
+    SENSOR,
+    Option,
+    Widths,
+    options,
+    sigma,
+)
+
+Array = NDArray[np.float64]
+Choice = tuple[int, ...]
+"""Index of an option of each of ``CLASSES``."""
+
+_UNLIKELY = 7.0
+"""Fields and choices less likely by a factor e^7 than the best do not count."""
+
+
+def likeliest(problem: Problem, state: State) -> Widths:
+    """The widths of the largest evidence, by the information and gradient of a state."""
+    fields = _fields(problem, state)
+    best = max(fields, key=lambda field: field.best[1])
+    return best.widths(best.best[0])
+
+
+def averaged(problem: Problem, state: State) -> State:
+    """The state moved to the mean over all widths, with the covariance over them."""
+    layout = Layout.of(problem)
+    fields = _fields(problem, state)
+    top = max(field.best[1] for field in fields)
+    likely = [field for field in fields if field.best[1] > top - _UNLIKELY]
+    logs = np.array([field.log_evidence() for field in likely])
+    weights = np.exp(logs - logsumexp(logs))
+    moments = [field.moments() for field in likely]
+    mean = sum((w * step for w, (step, _) in zip(weights, moments, strict=True)), np.zeros(1))
+    covariance = np.zeros((layout.size, layout.size))
+    for weight, (step, spread) in zip(weights, moments, strict=True):
+        covariance += weight * (spread + np.outer(step - mean, step - mean))
+    return replace(moved_state(problem, layout, state, mean), covariance=covariance)
+
+
+def _fields(problem: Problem, state: State) -> list[_Field]:
+    """The evidence for each level of the depth fields; the search goes on from the level before."""
+    base = _Base.of(problem, state)
+    found: list[_Field] = []
+    for field_per_m in FIELD_LEVELS:
+        found.append(_Field(base, float(field_per_m), found[-1].best[0] if found else None))
+    return found
+
+
+@dataclass(frozen=True)
+class _Base:
+    """The quadratic about a state without its uncertain priors."""
+
+    cameras: tuple[str, ...]
+    information: Array
+    gradient: Array
+    values: Array
+    """(m,) by which unknowns are off what is believed."""
+    groups: dict[str, list[Indices]]
+    """Unknowns of each class, one group a camera, or a single one."""
+    fields: list[Indices]
+    field_precision: Array
+    radius_m: float
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> _Base:
+        layout, model = Layout.of(problem), problem.model
+        information, gradient = state.information.copy(), state.gradient.copy()
+        values = np.zeros(layout.size)
+        for prior in priors(problem, layout, state):
+            values[prior.index] = prior.values
+        groups: dict[str, list[Indices]] = {name: [] for name in CLASSES}
+        fields = []
+        for name in problem.cameras:
+            index = layout.sensor(name)
+            gain, focal, cx, cy, k1, flat = index[model.widths_at]
+            members = ((gain,), (focal,), (cx, cy), (k1,), (flat,))
+            for group, of_group in zip(SENSOR, members, strict=True):
+                groups[group].append(np.array(of_group))
+            fields.append(index[model.field_start :])
+        groups[RADIUS], groups[BOW] = [layout.radius], [layout.bow]
+        certain = np.setdiff1d(
+            np.arange(layout.size),
+            np.concatenate([*(g for own in groups.values() for g in own), *fields]),
+        )
+        kept = np.isin(np.arange(layout.size), certain)
+        for prior in priors(problem, layout, state):
+            uncertain = ~kept[prior.index]
+            block = prior.information * uncertain[:, None] * uncertain
+            information[np.ix_(prior.index, prior.index)] -= block
+            gradient[prior.index] -= block @ prior.values
+        return cls(
+            tuple(problem.cameras), information, gradient, values, groups, fields,
+            model.field_precision, problem.radius_m,
+        )  # fmt: skip
+
+
+class _Field:
+    """All choices of widths where the depth fields have one standard deviation."""
+
+    def __init__(self, base: _Base, field_per_m: float, start: Choice | None) -> None:
+        self._base, self._field_per_m = base, field_per_m
+        information, gradient = base.information.copy(), base.gradient.copy()
+        precision, cost = base.field_precision / field_per_m**2, 0.0
+        for index in base.fields:
+            pull = precision @ base.values[index]
+            information[np.ix_(index, index)] += precision
+            gradient[index] += pull
+            cost += 0.5 * float(base.values[index] @ pull)
+        self._inner = np.concatenate([g for own in base.groups.values() for g in own])
+        self._outer = np.setdiff1d(np.arange(len(gradient)), self._inner)
+        inner, outer = self._inner, self._outer
+        self._factor = cho_factor(information[np.ix_(outer, outer)], lower=True)
+        mixed = information[np.ix_(outer, inner)]
+        right = np.column_stack([mixed, gradient[outer]])
+        solved = cho_solve(self._factor, right)
+        self._response, self._outer_step = -solved[:, :-1], -solved[:, -1]
+        reduced = information[np.ix_(inner, inner)] + mixed.T @ self._response
+        self._information = 0.5 * (reduced + reduced.T)
+        self._gradient = gradient[inner] + mixed.T @ self._outer_step
+        log_det = 2.0 * float(np.log(np.diag(self._factor[0])).sum())
+        cost += 0.5 * float(gradient[outer] @ self._outer_step)
+        self._constant = -cost - 0.5 * log_det
+        self._constant -= FIELD * len(base.fields) * float(np.log(field_per_m))
+        self._values = base.values[inner]
+        self._options = [options(name, len(base.cameras)) for name in CLASSES]
+        self._precisions = [
+            [self._precision(name, option) for option in own]
+            for name, own in zip(CLASSES, self._options, strict=True)
+        ]
+        self._log: dict[Choice, float] = {}
+        self.best = self._search(start)
+
+    def widths(self, choice: Choice) -> Widths:
+        """The widths that a choice means."""
+        chosen = [own[k].levels for own, k in zip(self._options, choice, strict=True)]
+        sensors = {
+            name: tuple(levels[place] for levels in chosen[: len(SENSOR)])
+            for place, name in enumerate(self._base.cameras)
+        }
+        return Widths(sensors, self._field_per_m, chosen[-2][0], chosen[-1][0])
+
+    def log_evidence(self) -> float:
+        """Log of the sum over all choices that were visited."""
+        return float(logsumexp(list(self._log.values())))
+
+    def moments(self) -> tuple[Array, Array]:
+        """Step (m,) to the mean over all choices, and the covariance (m, m) over them."""
+        likely = [(c, log) for c, log in self._log.items() if log > self.best[1] - _UNLIKELY]
+        logs = np.array([log for _, log in likely])
+        weights = np.exp(logs - logsumexp(logs))
+        precision = np.stack([self._diagonal(choice) for choice, _ in likely])
+        spread = np.linalg.inv(self._information + precision[:, None] * np.eye(len(self._values)))
+        steps = -np.einsum("mij,mj->mi", spread, self._gradient + precision * self._values)
+        mean = weights @ steps
+        inner = np.einsum("m,mij->ij", weights, spread)
+        inner += np.einsum("m,mi,mj->ij", weights, steps - mean, steps - mean)
+        size = len(self._inner) + len(self._outer)
+        step, covariance = np.zeros(size), np.zeros((size, size))
+        step[self._inner] = mean
+        step[self._outer] = self._outer_step + self._response @ mean
+        # What the inner unknowns leave open of the outer ones, and what those take from them.
+        carry = np.zeros((size, len(self._inner)))
+        carry[self._inner] = np.eye(len(self._inner))
+        carry[self._outer] = self._response
+        outer = cho_solve(self._factor, np.eye(len(self._outer)))
+        covariance[np.ix_(self._outer, self._outer)] = 0.5 * (outer + outer.T)
+        return step, covariance + carry @ inner @ carry.T
+
+    def _precision(self, name: str, option: Option) -> Array:
+        """Diagonal of a class's prior information."""
+        scales = {RADIUS: np.array([self._base.radius_m]), BOW: BOW_TOLERANCE}
+        scale = scales.get(name, np.ones(1))
+        groups = self._base.groups[name]
+        return np.concatenate(
+            [
+                np.ones(len(group)) * (sigma(name, level) * scale) ** -2.0
+                for group, level in zip(groups, option.levels, strict=True)
+            ]
+        )
+
+    def _diagonal(self, choice: Choice) -> Array:
+        return np.concatenate([own[k] for own, k in zip(self._precisions, choice, strict=True)])
+
+    def _search(self, start: Choice | None) -> tuple[Choice, float]:
+        """The choice of the largest evidence, from the soundest and the widest of all."""
+        ends = [(0,) * len(CLASSES), (LEVELS - 1,) * len(CLASSES)]
+        found = [self._climb(choice) for choice in (ends if start is None else [*ends, start])]
+        return max(found, key=lambda one: one[1])
+
+    def _climb(self, choice: Choice) -> tuple[Choice, float]:
+        while True:
+            near = [choice, *self._neighbours(choice)]
+            self._weigh([one for one in near if one not in self._log])
+            best = max(near, key=lambda one: self._log[one])
+            if best == choice:
+                return choice, self._log[choice]
+            choice = best
+
+    def _neighbours(self, choice: Choice) -> Iterator[Choice]:
+        """Choices that differ in one class, or in two."""
+        for a in range(len(CLASSES)):
+            for k in range(len(self._options[a])):
+                one = (*choice[:a], k, *choice[a + 1 :])
+                if k != choice[a]:
+                    yield one
+                    for b in range(a):
+                        for j in range(len(self._options[b])):
+                            if j != choice[b]:
+                                yield (*one[:b], j, *one[b + 1 :])
+
+    def _weigh(self, choices: Sequence[Choice]) -> None:
+        if not choices:
+            return
+        precision = np.stack([self._diagonal(choice) for choice in choices])
+        right = self._gradient + precision * self._values
+        whole = self._information + precision[:, None] * np.eye(len(self._values))
+        root = np.linalg.cholesky(whole)
+        half = np.linalg.solve(root, right[..., None])[..., 0]
+        log = 0.5 * np.sum(half**2, axis=1) - 0.5 * np.sum(precision * self._values**2, axis=1)
+        log -= np.log(np.einsum("mii->mi", root)).sum(axis=1)
+        log += 0.5 * np.log(precision).sum(axis=1) + self._constant
+        for choice, value in zip(choices, log, strict=True):
+            prior = sum(own[k].log_prior for own, k in zip(self._options, choice, strict=True))
+            self._log[choice] = float(value) + prior

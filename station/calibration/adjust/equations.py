@@ -1,0 +1,309 @@
+"""Normal equations of one camera's sightings and surfaces, its sensor's parameters included.
+
+Each patch of pixels gives one residual r = w + D theta - w_expected, with the measured inverse
+depth w, the sensor's parameters theta (`sensor_model`) and the expected inverse depth of a ball
+(centre c, radius R) or a plane along the patch's ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.adjust.problem import Sightings, Surface
+from station.calibration.adjust.sensor_model import SensorModel
+from station.calibration.detect.ball_image import ball_inverse_depth
+from station.core.lens import pixel_rays
+from station.core.rig import CameraCalibration
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+TREMOR_M = 2e-4
+"""Standard deviation along each axis of a hand's tremor about a path that bends every tenth of a
+second."""
+ROUNDNESS = 3e-3
+"""Standard deviation of the ball's radius from one side to another, relative: what a ball made for
+play is off round."""
+_NO_TRUST = 1e-9
+_HUBER = 3.0
+"""Patches of a surface beyond so many standard deviations count less (Huber)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Balls:
+    """Normal equations of (centre, radius; theta) of n detections, H (n, 4, 4) and so on.
+
+    ``theta_matrix`` (U, U) and ``theta_gradient`` (U,) are summed over the detections.
+    """
+
+    matrix: Array
+    gradient: Array
+    mixed: Array
+    """(n, 4, U)"""
+    theta_matrix: Array
+    theta_gradient: Array
+
+    def summed(self) -> Balls:
+        """All detections as one: those of a ball that rests."""
+        return Balls(
+            self.matrix.sum(axis=0)[None],
+            self.gradient.sum(axis=0)[None],
+            self.mixed.sum(axis=0)[None],
+            self.theta_matrix,
+            self.theta_gradient,
+        )
+
+    def off_center(self, radius_m: float, trust: Array) -> Balls:
+        """The equations once each detection has a tremor and a radius error of its own.
+
+        The four nuisance parameters d with prior information L are eliminated: H becomes
+        H - H (H + L)^-1 H, and so on. ``trust`` (n,) is what the equations were weighed by.
+        """
+        prior = np.diag(np.array([*[TREMOR_M] * 3, ROUNDNESS * radius_m]) ** -2.0)
+        weighed = np.maximum(trust, _NO_TRUST)[:, None, None] * prior
+        inverse = np.linalg.inv(self.matrix + weighed)
+        taken = self.matrix @ inverse
+        half = np.swapaxes(np.linalg.cholesky(inverse), 1, 2) @ self.mixed
+        flat = half.reshape(4 * len(half), half.shape[-1])
+        return Balls(
+            self.matrix - taken @ self.matrix,
+            self.gradient - np.einsum("nij,nj->ni", taken, self.gradient),
+            self.mixed - taken @ self.mixed,
+            self.theta_matrix - flat.T @ flat,
+            self.theta_gradient
+            - np.einsum("niu,nij,nj->u", self.mixed, inverse, self.gradient, optimize=True),
+        )
+
+    def moved(self, shift: Array) -> Balls:
+        """The equations about centres that lie elsewhere by shifts (n, 3)."""
+        return Balls(
+            self.matrix,
+            self.gradient + np.einsum("nij,nj->ni", self.matrix[..., :3], shift),
+            self.mixed,
+            self.theta_matrix,
+            self.theta_gradient + np.einsum("niu,ni->u", self.mixed[:, :3], shift),
+        )
+
+
+def center_equations(
+    seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
+    parameters: Array, radius_m: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """H (n, 4, 4) and gradient (n, 4) of centre and radius, without the sensor's parameters."""
+    rows = _ball_rows(seen, camera, model, centers, parameters, radius_m)
+    weighted = rows.jacobian * seen.weight[..., None]
+    return (
+        np.swapaxes(weighted, 1, 2) @ rows.jacobian,
+        np.einsum("nki,nk->ni", weighted, rows.residual),
+    )
+
+
+def ball_equations(
+    seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
+    parameters: Array, radius_m: float, trust: Array,
+) -> Balls:  # fmt: skip
+    """All equations, each detection weighed by its trust (n,)."""
+    rows = _ball_rows(seen, camera, model, centers, parameters, radius_m)
+    weight = seen.weight * trust[:, None]
+    weighted = rows.jacobian * weight[..., None]
+    patches = seen.inverse.shape[1]
+    design = _design(
+        model, camera, rows.expected.ravel(), seen.place.reshape(-1, 2),
+        rows.ray.reshape(-1, 2), rows.by_ray.reshape(-1, 2), rows.by_flattening.ravel(),
+    )  # fmt: skip
+    return Balls(
+        np.swapaxes(weighted, 1, 2) @ rows.jacobian,
+        np.einsum("nki,nk->ni", weighted, rows.residual),
+        *design.products(
+            model.size, rows.jacobian.reshape(-1, 4), weight.ravel(), rows.residual.ravel(), patches
+        ),
+    )
+
+
+def recentred(
+    seen: Sightings, camera: CameraCalibration, model: SensorModel, parameters: Array,
+    radius_m: float,
+) -> Array:  # fmt: skip
+    """Centres (n, 3) that each detection has by itself, given the sensor's parameters."""
+    centers = seen.centers.copy()
+    for _ in range(4):
+        matrix, gradient = center_equations(seen, camera, model, centers, parameters, radius_m)
+        centers -= np.linalg.solve(matrix[:, :3, :3], gradient[:, :3, None])[..., 0]
+    return centers
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    residual: Array
+    expected: Array
+    """Measured inverse depth as it is expected."""
+    jacobian: Array
+    """(n, k, 4) by centre and radius."""
+    ray: Array
+    by_ray: Array
+    """(n, k, 2): derivative of the ball's inverse depth."""
+    by_flattening: Array
+    """(n, k)"""
+
+
+def _ball_rows(
+    seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
+    parameters: Array, radius_m: float,
+) -> _Rows:  # fmt: skip
+    lens = model.camera(camera, parameters)
+    ray = pixel_rays(lens, seen.pixels)
+    w, gradient = ball_inverse_depth(centers, ray, radius_m)
+    # A side that is flatter by k stands k R (1 - cos^2) higher where it is so far off its middle.
+    towards = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) / w[..., None]
+    apart = np.einsum("nki,ni->nk", towards - centers[:, None], centers)
+    cosine = apart / (radius_m * np.linalg.norm(centers, axis=1)[:, None])
+    flatter = gradient[..., 3] * radius_m * (1.0 - np.minimum(cosine**2, 1.0))
+    w = w + model.flattening(parameters) * flatter
+    place = seen.place.reshape(-1, 2)
+    flat = w.ravel()
+    expected = flat - model.change(parameters, flat, place)
+    change = model.change(parameters, expected, place).reshape(w.shape)
+    return _Rows(
+        seen.inverse + change - w,
+        expected.reshape(w.shape),
+        -gradient[..., :4],
+        ray,
+        gradient[..., 4:],
+        flatter,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """Normal equations of (plane m, bow) (10) and theta (U) of one view of a surface."""
+
+    matrix: Array
+    """(10, 10)"""
+    gradient: Array
+    """(10,)"""
+    mixed: Array
+    """(10, U)"""
+    theta_matrix: Array
+    theta_gradient: Array
+    misfit: float
+    """Mean squared residual in units of the expected variance."""
+
+
+def plane_equations(
+    surface: Surface, camera: CameraCalibration, model: SensorModel, plane: Array,
+    parameters: Array, bow: Array,
+) -> Planes:  # fmt: skip
+    """Equations at a plane m (3,) and a bow (7,), which only floors have."""
+    ray = pixel_rays(model.camera(camera, parameters), surface.pixels)
+    towards = np.column_stack([ray, np.ones(len(ray))])
+    w = towards @ plane
+    # What stands h out of a plane at the distance d raises the inverse depth by w h / d.
+    raised = np.zeros((len(ray), len(bow)))
+    if surface.bow_terms is not None:
+        raised = surface.bow_terms * (w * np.linalg.norm(plane))[:, None]
+    expected = w + raised @ bow
+    measured = expected - model.change(parameters, expected, surface.place)
+    change = model.change(parameters, measured, surface.place)
+    residual = surface.inverse + change - expected
+    squared = surface.weight * residual**2
+    misfit = float(np.median(squared) / _MEDIAN_SQUARE)
+    spread = max(1.0, misfit)
+    size = np.sqrt(squared / spread)
+    weight = surface.weight / spread * np.minimum(1.0, _HUBER / np.maximum(size, _HUBER))
+    jacobian = np.concatenate([-towards, -raised], axis=1)
+    by_ray = np.broadcast_to(plane[:2], ray.shape)
+    nothing = np.zeros(len(ray))
+    design = _design(model, camera, measured, surface.place, ray, by_ray, nothing)
+    weighted = jacobian * weight[:, None]
+    mixed, theta_matrix, theta_gradient = design.products(
+        model.size, jacobian, weight, residual, len(weight)
+    )
+    return Planes(
+        weighted.T @ jacobian,
+        weighted.T @ residual,
+        mixed[0],
+        theta_matrix,
+        theta_gradient,
+        misfit,
+    )
+
+
+_MEDIAN_SQUARE = 0.4549
+"""Median of the square of a standard normal number."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Design:
+    """Derivatives of n residuals by the sensor's parameters, most of which are zero."""
+
+    dense: Array
+    """(n, d) by the first d parameters."""
+    index: Indices
+    """(n, s) of the others that count, increasing, and ..."""
+    value: Array
+    """... the derivatives by them."""
+
+    def products(
+        self, size: int, jacobian: Array, weight: Array, residual: Array, rows: int
+    ) -> tuple[Array, Array, Array]:
+        """J^T W D of every so many rows (n / rows, j, size), D^T W D and D^T W r."""
+        mixed = np.zeros((len(weight) // max(rows, 1), jacobian.shape[1], size))
+        matrix, gradient = np.zeros((size, size)), np.zeros(size)
+        _accumulate(
+            self.dense, self.index, self.value, np.ascontiguousarray(jacobian), weight, residual,
+            rows, mixed, matrix, gradient,
+        )  # fmt: skip
+        return mixed, matrix + np.triu(matrix, 1).T, gradient
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(dense, index, value, jacobian, weight, residual, rows, mixed, matrix, gradient):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the products of all rows; of the symmetric one its upper triangle."""
+    first, others = dense.shape[1], index.shape[1]
+    place = np.empty(first + others, np.int64)
+    share = np.empty(first + others)
+    for n in range(len(weight)):
+        if weight[n] == 0.0:
+            continue
+        for a in range(first):
+            place[a], share[a] = a, dense[n, a]
+        for a in range(others):
+            place[first + a], share[first + a] = index[n, a], value[n, a]
+        for a in range(first + others):
+            scaled = weight[n] * share[a]
+            if scaled == 0.0:
+                continue
+            gradient[place[a]] += scaled * residual[n]
+            for b in range(a, first + others):
+                matrix[place[a], place[b]] += scaled * share[b]
+            for j in range(jacobian.shape[1]):
+                mixed[n // rows, j, place[a]] += scaled * jacobian[n, j]
+
+
+def _design(
+    model: SensorModel, camera: CameraCalibration, measured: Array, place: Array, ray: Array,
+    by_ray: Array, by_flattening: Array,
+) -> _Design:  # fmt: skip
+    """Derivatives of residuals by the sensor's parameters."""
+    columns = [model.polynomial_design(measured, place)]
+    if model.lens:
+        columns.append(-np.einsum("ni,nij->nj", by_ray, model.lens_design(camera, ray)))
+        columns.append(-by_flattening[:, None])
+    dense = np.concatenate(columns, axis=1)
+    if not model.field:
+        return _Design(dense, np.zeros((len(dense), 0), np.int64), np.zeros((len(dense), 0)))
+    index, value = model.field_design(measured, place)
+    return _Design(dense, index + model.field_start, value)
+
+
+def bow_terms(points: Array, mark: Array, up: Array) -> Array:
+    """Terms (n, 7) of the floor's bow at points (n, 3), about the mark."""
+    first = np.cross(up, (1.0, 0.0, 0.0))
+    first /= np.linalg.norm(first)
+    away = points - mark
+    x, y = away @ first, away @ np.cross(up, first)
+    return np.stack([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=-1)

@@ -1,0 +1,318 @@
+"""The normal equations of all measurements: poses, sensors, clock offsets, the path, surfaces.
+
+Gauss-Newton over all measurements, each patch of pixels weighed by the sensor's noise. The unknowns
+are two groups. The path's control points touch only their neighbours, so their normal matrix is
+banded. All others border it. Factoring the band and taking the Schur complement gives the exact
+step, and the border's covariance with the path marginalised.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csr_matrix
+
+from station.calibration.adjust.equations import (
+    Balls,
+    ball_equations,
+    center_equations,
+    plane_equations,
+)
+from station.calibration.adjust.problem import (
+    BOW,
+    FOOT,
+    Indices,
+    Layout,
+    Problem,
+    Sightings,
+    State,
+    Surface,
+    priors,
+)
+from station.calibration.adjust.trajectory import along
+from station.calibration.detect.detections import FLOOR
+from station.core.geometry import skew
+from station.core.kinect_v1 import FROZEN_SHARE
+
+Array = NDArray[np.float64]
+
+CONTACT_M = 0.0005
+"""Standard deviation of a ball's height on an even floor."""
+TAPE_M = 0.001
+"""Standard deviation of a height that was measured with a tape."""
+_TAIL = 4.0
+"""Degrees of freedom (Student's t) of a contact that may be none."""
+_NEAR_M = 0.05
+"""Depth errors that are not corrected yet shift a ball along its ray, by less than that."""
+_BESIDE_M = 0.015
+"""A centre this little beside the detected one is where the equations are linear enough."""
+_GATE = 11.3
+"""Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
+_REJECT = 60.0
+_LEAST_TYPICAL = 0.2
+"""Least typical deviation, as a share of the noise's variance."""
+MEDIAN = 2.366
+"""Median of chi-square with three degrees of freedom."""
+
+
+class NormalEquations:
+    """The normal equations at a state, with the ball's noise so many times what is expected."""
+
+    def __init__(self, problem: Problem, layout: Layout, state: State, scale: float = 1.0) -> None:
+        self._problem, self._layout, self._state = problem, layout, state
+        self._trust = scale**-2.0
+        count = state.grid.count
+        self._border = np.zeros((layout.size, layout.size))
+        self._gradient = np.zeros(layout.size)
+        self._coupling = np.zeros((layout.size, 3 * count))
+        self._band = np.zeros((12, 3 * count))
+        self._path_gradient = np.zeros(3 * count)
+        self.deviations: dict[str, Array] = {}
+        self._cost, self._seen = 0.0, 0.0
+        self._path_share = np.zeros(count)
+        self._smooth()
+        self._priors()
+        for seen in problem.waved.values():
+            self._add_waved(seen)
+        for place, sightings in problem.resting.items():
+            for seen in sightings:
+                self._add_resting(place, seen)
+        for surface in problem.surfaces:
+            self._add_surface(surface)
+        for place in problem.resting:
+            self._add_contact(place)
+
+    def solve(self) -> tuple[Array, Array, float]:
+        """Steps of the border (m,) and the path (count, 3); the border's in standard deviations."""
+        information, gradient = self.reduced()
+        step = np.asarray(-cho_solve(cho_factor(information), gradient))
+        path = -self._band_solve(self._path_gradient + self._coupling.T @ step)
+        return step, path.reshape(-1, 3), float(np.sqrt(step @ information @ step))
+
+    def reduced(self) -> tuple[Array, Array]:
+        """The border's information (m, m) and gradient (m,), the path marginalised."""
+        self._factor = cholesky_banded(self._band)
+        # D = U^T U: half of the solution is enough for the symmetric E D^-1 E^T.
+        half, fault = dtbtrs(self._factor, self._coupling.T, uplo="U", trans="T")
+        if fault:
+            raise np.linalg.LinAlgError("the path is not determined")
+        reduced = self._border - half.T @ half
+        gradient = self._gradient - self._coupling @ self._band_solve(self._path_gradient)
+        return np.asarray(0.5 * (reduced + reduced.T)), gradient
+
+    def scale(self) -> float:
+        """Observed over expected deviation of the detections' centres."""
+        unknowns = 3.0 * np.sum(np.abs(self._path_share) > 0.5) + 12 * len(self._problem.cameras)
+        return float(np.sqrt(self._cost / max(3.0 * self._seen - unknowns, 1.0)))
+
+    def _band_solve(self, right: Array) -> Array:
+        return np.asarray(cho_solve_banded((self._factor, False), right))
+
+    def _smooth(self) -> None:
+        band = self._state.grid.smoothness()
+        for offset in range(3):
+            # One axis' neighbours are three columns apart once the axes are interleaved.
+            self._band[11 - 3 * offset] += np.repeat(band[2 - offset], 3)
+        path = self._state.controls
+        bend = path[2:] - 2.0 * path[1:-1] + path[:-2]
+        weight = band[2, 0]
+        gradient = np.zeros_like(path)
+        gradient[2:] += bend
+        gradient[1:-1] -= 2.0 * bend
+        gradient[:-2] += bend
+        self._path_gradient += weight * gradient.ravel()
+        self._band[11] += 1e-6 * weight
+
+    def _priors(self) -> None:
+        for prior in priors(self._problem, self._layout, self._state):
+            self._border[np.ix_(prior.index, prior.index)] += prior.information
+            self._gradient[prior.index] += prior.information @ prior.values
+
+    def _balls(self, seen: Sightings, centers: Array, trust: Array) -> Balls:
+        problem, state = self._problem, self._state
+        return ball_equations(
+            seen, problem.cameras[seen.camera], problem.model, centers,
+            state.sensors[seen.camera], state.radius_m, trust,
+        )  # fmt: skip
+
+    def _deviation(self, seen: Sightings, centers: Array, at: Array, still: bool) -> Array:
+        """(n,): squared distance of each detection's own centre from the one assumed."""
+        problem, state = self._problem, self._state
+        matrix, gradient = center_equations(
+            seen, problem.cameras[seen.camera], problem.model, centers,
+            state.sensors[seen.camera], state.radius_m,
+        )  # fmt: skip
+        nothing = np.zeros((len(matrix), 4, 0))
+        balls = Balls(matrix, gradient, nothing, np.zeros((0, 0)), np.zeros(0)).moved(at - centers)
+        if not still:
+            balls = balls.off_center(problem.radius_m, np.ones(len(matrix)))
+        inner, right = balls.matrix[:, :3, :3], balls.gradient[:, :3]
+        return np.asarray(
+            np.einsum("ni,ni->n", right, np.linalg.solve(inner, right[..., None])[..., 0])
+        )
+
+    def _add_waved(self, seen: Sightings) -> None:
+        if not len(seen.times_s):
+            return
+        state, layout, name = self._state, self._layout, seen.camera
+        pose = state.poses[name]
+        first, value, rate = state.grid.basis(seen.times_s + state.clock_s[name])
+        centers = (along(state.controls, first, value) - pose[:3, 3]) @ pose[:3, :3]
+        near = _near(centers, seen.centers)
+        deviation = self._deviation(seen, near, centers, still=False)
+        self.deviations[name] = deviation
+        robust = _robust_weight(deviation)
+        self._cost += float(np.sum(robust * np.minimum(deviation, _GATE)))
+        self._seen += float(np.sum(robust))
+        for k in range(4):
+            np.add.at(self._path_share, first + k, 0.25 * robust)
+        trust = self._trust * robust
+        balls = self._balls(seen, near, trust).moved(centers - near)
+        balls = balls.off_center(self._problem.radius_m, trust)
+
+        chain = np.zeros((len(centers), 4, FOOT + 1))
+        chain[:, :3, :3] = skew(centers)
+        chain[:, :3, 3:6] = -np.eye(3)
+        chain[:, :3, 6] = along(state.controls, first, rate) @ pose[:3, :3]
+        chain[:, 3, 7] = 1.0
+        index = np.concatenate([layout.camera(name)[:FOOT], layout.radius])
+        sensor = layout.sensor(name)
+        self._add_balls(balls, chain, index, sensor)
+        carried = balls.matrix @ chain
+        path = _path_rows(first, value, pose[:3, :3], state.grid.count)
+        border = np.concatenate([carried[:, :3], balls.mixed[:, :3]], axis=2)
+        coupling = path.T @ border.reshape(-1, border.shape[2])
+        columns = np.concatenate([index, sensor])
+        kept = columns >= 0
+        self._coupling[columns[kept]] += coupling.T[kept]
+        self._path_gradient += path.T @ balls.gradient[:, :3].ravel()
+        self._add_band(first, value, pose[:3, :3] @ balls.matrix[:, :3, :3] @ pose[:3, :3].T)
+
+    def _add_band(self, first: Indices, value: Array, matrix: Array) -> None:
+        """Information (n, 3, 3) of points on the path, reference frame."""
+        for j in range(4):
+            for k in range(j, 4):
+                block = (value[:, j] * value[:, k])[:, None, None] * matrix
+                for a in range(3):
+                    for b in range(3):
+                        offset = 3 * (k - j) + b - a
+                        if offset >= 0:
+                            column = 3 * (first + k) + b
+                            np.add.at(self._band[11 - offset], column, block[:, a, b])
+
+    def _add_resting(self, place: str, seen: Sightings) -> None:
+        state, layout, name = self._state, self._layout, seen.camera
+        pose, looks = state.poses[name], len(seen.times_s)
+        center = (state.places[place] - pose[:3, 3]) @ pose[:3, :3]
+        centers = np.repeat(center[None], looks, axis=0)
+        robust = _robust_weight(self._deviation(seen, centers, centers, still=True))
+        # Looks at a still ball share the part of the noise that stays.
+        trust = self._trust * robust / (FROZEN_SHARE * looks + 1.0 - FROZEN_SHARE)
+        balls = self._balls(seen, centers, trust).summed()
+        balls = balls.off_center(self._problem.radius_m, np.array([self._trust]))
+        chain = np.zeros((1, 4, 6 + 3 + 1))
+        chain[0, :3, :3], chain[0, :3, 3:6] = skew(center), -np.eye(3)
+        chain[0, :3, 6:9] = pose[:3, :3].T
+        chain[0, 3, 9] = 1.0
+        index = np.concatenate([layout.camera(name)[:6], layout.triple(place), layout.radius])
+        self._add_balls(balls, chain, index, layout.sensor(name))
+
+    def _add_balls(self, balls: Balls, chain: Array, index: Indices, sensor: Indices) -> None:
+        kept = index >= 0
+        chain, index = chain[..., kept], index[kept]
+        carried = balls.matrix @ chain
+        self._border[np.ix_(index, index)] += np.einsum("nij,nik->jk", chain, carried)
+        self._gradient[index] += np.einsum("nij,ni->j", chain, balls.gradient)
+        mixed = np.einsum("nij,niu->ju", chain, balls.mixed, optimize=True)
+        self._add_sensor(mixed, index, sensor, balls.theta_matrix, balls.theta_gradient)
+
+    def _add_sensor(
+        self, mixed: Array, index: Indices, sensor: Indices, matrix: Array, gradient: Array
+    ) -> None:
+        self._border[np.ix_(index, sensor)] += mixed
+        self._border[np.ix_(sensor, index)] += mixed.T
+        self._border[np.ix_(sensor, sensor)] += matrix
+        self._gradient[sensor] += gradient
+
+    def _add_surface(self, surface: Surface) -> None:
+        problem, layout, state = self._problem, self._layout, self._state
+        name = surface.camera
+        pose, q = state.poses[name], state.planes[surface.surface]
+        rotation, shift = pose[:3, :3], pose[:3, 3]
+        m = rotation.T @ q / (1.0 - q @ shift)
+        view = plane_equations(
+            surface, problem.cameras[name], problem.model, m, state.sensors[name], state.bow
+        )
+        chain = np.zeros((3 + BOW, 6 + 3 + BOW))
+        chain[:3, :3], chain[:3, 3:6] = skew(m), np.outer(m, m)
+        chain[:3, 6:9] = rotation.T / (1.0 - q @ shift) + np.outer(m, shift) / (1.0 - q @ shift)
+        chain[3:, 9:] = np.eye(BOW)
+        index = np.concatenate(
+            [layout.camera(name)[:6], layout.triple(surface.surface), layout.bow]
+        )
+        kept = index >= 0
+        chain, index = chain[:, kept], index[kept]
+        self._border[np.ix_(index, index)] += chain.T @ view.matrix @ chain
+        self._gradient[index] += chain.T @ view.gradient
+        self._add_sensor(
+            chain.T @ view.mixed, index, layout.sensor(name), view.theta_matrix, view.theta_gradient
+        )
+
+    def _add_contact(self, place: str) -> None:
+        """The ball rests on the floor, or on a stand of measured height above it."""
+        problem, layout, state = self._problem, self._layout, self._state
+        at, q = state.places[place], state.planes[FLOOR]
+        length = np.linalg.norm(q)
+        height_m = problem.heights_m.get(place, 0.0)
+        above = (1.0 - q @ at) / length
+        terms = problem.bow_terms.get(place, np.zeros(BOW))
+        off_m = above - terms @ state.bow - state.radius_m - height_m
+        row = np.concatenate([-q / length, -at / length - above * q / length**2, [-1.0], -terms])
+        index = np.concatenate(
+            [layout.triple(place), layout.triple(FLOOR), layout.radius, layout.bow]
+        )
+        sigma_m = np.hypot(CONTACT_M, TAPE_M) if place in problem.heights_m else CONTACT_M
+        # A ball that lies on something else is refused later: it must not tilt the floor.
+        weight = sigma_m**-2.0 * _TAIL / (_TAIL + (off_m / sigma_m) ** 2)
+        self._border[np.ix_(index, index)] += weight * np.outer(row, row)
+        self._gradient[index] += weight * off_m * row
+
+
+def _path_rows(first: Indices, value: Array, rotation: Array, count: int) -> csr_matrix:
+    """Derivatives of centres in the camera (3 n) by control points (3 count)."""
+    data = value[:, None, :, None] * rotation.T[None, :, None, :]
+    column = 3 * first[:, None, None, None] + np.arange(12).reshape(1, 1, 4, 3)
+    column = np.broadcast_to(column, data.shape)
+    rows = 3 * len(first)
+    return csr_matrix(
+        (data.ravel(), column.ravel(), np.arange(0, 12 * rows + 1, 12)), shape=(rows, 3 * count)
+    )
+
+
+def _near(centers: Array, detected: Array) -> Array:
+    """Points of linearisation (n, 3): as far as the centres, but where the rays meet the ball.
+
+    The image of a ball does not tell how well a place decimetres away agrees with it.
+    """
+    ray = detected / np.linalg.norm(detected, axis=1, keepdims=True)
+    off = centers - detected
+    farther_m = np.einsum("ni,ni->n", off, ray)
+    beside_m = np.linalg.norm(off - farther_m[:, None] * ray, axis=1)
+    near = detected + np.clip(farther_m, -_NEAR_M, _NEAR_M)[:, None] * ray
+    usable = (beside_m < _BESIDE_M) & (np.abs(farther_m) < _NEAR_M)
+    return np.asarray(np.where(usable[:, None], centers, near))
+
+
+def _robust_weight(deviation: Array) -> Array:
+    """Weights (n,) that leave out what deviates far more than most do.
+
+    As long as depth errors are not yet corrected all deviate, and none may be left out for that.
+    Once they are most deviate by less than the noise that is assumed: fingers over the ball then
+    show, although they deviate by no more than that noise could.
+    """
+    typical = max(float(np.median(deviation)) / MEDIAN, _LEAST_TYPICAL)
+    deviation = deviation / typical
+    far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
+    return np.where(deviation < _REJECT, far, 0.0)

@@ -1,0 +1,118 @@
+"""Errors of heights, girths and the cloud that follow from a calibration's covariance.
+
+A standing body is replaced by rings of points about the mark. A camera that sees a point at the
+depth z with the ray d reports X = T d z; its change by the pose's twist and the sensor's parameters
+gives one row per point, and a girth is the mean of its ring's rows times 2 pi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.calibration.adjust.problem import Layout, Problem, State
+from station.calibration.adjust.sensor_model import LENS, POLYNOMIAL, SensorModel, image_place
+from station.calibration.solve.world import Placed
+from station.core.geometry import invert, skew, transform
+from station.core.lens import pixel_rays, project
+from station.core.rig import CameraCalibration, PredictedError
+
+Array = NDArray[np.float64]
+
+_RINGS_M = {"chest": 1.28, "waist": 1.08, "hip": 0.88}
+_HALF_WIDTH_M, _HALF_DEPTH_M = 0.17, 0.12
+_AROUND = 24
+_LEGS_M = (0.15, 0.4, 0.65)
+_CROWN_M = 1.75
+_FACING = 0.35
+"""Least cosine between a surface's normal and the direction to a camera that counts."""
+_DEPTHS_M = (0.6, 3.0)
+
+
+def predict(
+    problem: Problem, state: State, placed: Placed, cameras: Mapping[str, CameraCalibration]
+) -> PredictedError:
+    """Standard deviations of what the calibration adds to a scan; ``cameras`` as solved."""
+    layout = Layout.of(problem)
+
+    def normals(points: Array, directions: Array) -> Array:
+        return _rows(problem.model, layout, placed, cameras, points, directions)
+
+    def sigma(row: Array) -> float:
+        return float(np.sqrt(max(float(row @ state.covariance @ row), 0.0)))
+
+    every, girths = [], []
+    for height_m in (*_LEGS_M, *_RINGS_M.values()):
+        rows = normals(*_ring(height_m))
+        every.append(rows)
+        if height_m in _RINGS_M.values():
+            girths.append(sigma(2.0 * np.pi * rows.mean(axis=0)))
+    crown = normals(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0]
+    whole = np.concatenate(every)
+    variance = np.einsum("ni,ij,nj->n", whole, state.covariance, whole, optimize=True)
+    return PredictedError(
+        height_sigma_m=sigma(crown),
+        girth_sigma_m=max(girths),
+        normal_rms_m=float(np.sqrt(variance.mean())),
+        tilt_sigma_rad=placed.slope_sigma_rad,
+    )
+
+
+def _ring(height_m: float) -> tuple[Array, Array]:
+    """Points (n, 3) around a body at a height, at even turns of their normals (n, 3)."""
+    turn = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    nx, ny = np.cos(turn), np.sin(turn)
+    length = np.hypot(_HALF_WIDTH_M * nx, _HALF_DEPTH_M * ny)
+    points = np.stack(
+        [
+            _HALF_WIDTH_M**2 * nx / length,
+            _HALF_DEPTH_M**2 * ny / length,
+            np.full(_AROUND, height_m),
+        ],
+        axis=1,
+    )
+    return points, np.stack([nx, ny, np.zeros(_AROUND)], axis=1)
+
+
+def _rows(
+    model: SensorModel, layout: Layout, placed: Placed,
+    cameras: Mapping[str, CameraCalibration], points: Array, directions: Array,
+) -> Array:  # fmt: skip
+    """Derivatives (n, m) of points along directions by all unknowns, of those that are seen."""
+    total, seen = np.zeros((len(points), layout.size)), np.zeros(len(points))
+    for place, (name, camera) in enumerate(cameras.items()):
+        pose = placed.world_from_camera[name]
+        local = transform(invert(pose), points)
+        pixels = project(camera, local)
+        towards = pose[:3, 3] - points
+        facing = np.einsum("ni,ni->n", directions, towards) / np.linalg.norm(towards, axis=1)
+        upward = directions[:, 2] > 0.9
+        size = (camera.width - 1, camera.height - 1)
+        good = (np.where(upward, 1.0, facing) > _FACING) & (local[:, 2] > _DEPTHS_M[0])
+        good &= (local[:, 2] < _DEPTHS_M[1]) & ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        if not good.any():
+            continue
+        local, pixels, along = local[good], pixels[good], directions[good] @ pose[:3, :3]
+        weight = np.where(upward, 1.0, facing)[good]
+        row = np.zeros((len(local), layout.size))
+        twist = np.concatenate([-np.einsum("ni,nij->nj", along, skew(local)), along], axis=1)
+        row += twist @ placed.jacobian[6 * place : 6 * place + 6]
+        index = layout.sensor(name)
+        inverse = 1.0 / local[:, 2]
+        where = image_place(camera, pixels)
+        nearer = -np.einsum("ni,ni->n", along, local) / inverse
+        row[:, index[:POLYNOMIAL]] += nearer[:, None] * model.polynomial_design(inverse, where)
+        if model.lens:
+            design = model.lens_design(camera, pixel_rays(camera, pixels))
+            sideways = np.einsum("ni,nij->nj", along[:, :2], design) / inverse[:, None]
+            row[:, index[POLYNOMIAL : POLYNOMIAL + LENS]] += sideways
+        if model.field:
+            control, share = model.field_design(inverse, where)
+            rows = np.arange(len(local))[:, None]
+            np.add.at(row, (rows, index[model.field_start :][control]), nearer[:, None] * share)
+        total[good] += weight[:, None] * row
+        seen[good] += weight
+    covered = seen > 0.0
+    return np.asarray(total[covered] / seen[covered, None])

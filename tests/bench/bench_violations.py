@@ -1,0 +1,140 @@
+"""Calibration of booths whose sensors, ball, floor and helper err otherwise than is assumed.
+
+Each row is one violation of `station.simulation.violations`; its parameters are drawn from
+distributions that the solution never reads. Detections are drawn directly, or found in rendered
+images (--images).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import synthetic_calibration as synthetic
+from scan_distortion import Distortion, distortion
+
+from station.calibration.detect.detections import Observations
+from station.calibration.solve.solution import Solution, solve
+from station.calibration.solve.world import relatives
+from station.core.errors import CalibrationError
+from station.core.geometry import invert, twist_between
+from station.simulation import violations
+from station.simulation.observations import simulate
+from station.simulation.procedure import VirtualProcedure
+from station.simulation.scene import load_mesh
+from station.simulation.sensor import SimulatedBooth
+
+_BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
+_REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
+_ALL_DIRECT = tuple(v for v in violations.ALL if v not in (violations.HAND, violations.HELPER))
+CASES: dict[str, tuple[str, ...]] = {
+    "clean": (),
+    "bias": (violations.BIAS,),
+    "lens": (violations.LENS,),
+    "k1": (violations.K1,),
+    "floor, ball, frozen": (violations.FLOOR, violations.BALL, violations.FROZEN),
+    "raw law": (violations.RAW_LAW,),
+    "hand, helper": (violations.HAND, violations.HELPER),
+    "all": violations.ALL,
+}
+_DIRECT = [name for name in CASES if name != "hand, helper"]
+
+
+def observe(booth: SimulatedBooth, images: bool) -> Observations:
+    """A booth's detections."""
+    procedure = VirtualProcedure(booth)
+    if not images:
+        return synthetic.observations(procedure, boards=True, stands=True)
+    cameras = synthetic.factory(booth.rig)
+    return Observations.merged([simulate(procedure, camera) for camera in cameras.values()])
+
+
+def judge(name: str, seed: int, images: bool) -> str:
+    """One booth's row of the table."""
+    booth = synthetic.booth(seed, switches=CASES[name])
+    seen = observe(booth, images)
+    start_s = time.process_time()
+    try:
+        solution = solve(
+            seen, synthetic.factory(booth.rig), radius_m=0.1, reference=_REFERENCE,
+            front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
+        )  # fmt: skip
+    except CalibrationError as refusal:
+        return f"{name:<20}{seed:>4}  refused: {refusal}"
+    seconds = time.process_time() - start_s
+    shifts, chi2 = _pairs(booth, solution)
+    found: Distortion = distortion(booth, solution.rig, load_mesh(_BODY))
+    predicted = solution.rig.predicted
+    assert predicted is not None
+    girths = np.abs(found.girths_mm)
+    tilt_sigma_deg = float(np.degrees(predicted.tilt_sigma_rad))
+    bars = {
+        "chi2": 0.5 <= chi2 <= 3.0,
+        "cloud": found.normal_rms_mm <= (0.6 if CASES[name] else 0.15),
+        "pairs": bool(CASES[name]) or np.mean(shifts) <= 1.2,
+        "tilt": found.tilt_deg <= min(0.15, 3.0 * tilt_sigma_deg),
+        "height": abs(found.height_mm) <= 2.0,
+        "girths": girths.mean() <= 2.0 and girths.max() <= 5.0,
+        "seconds": seconds <= 20.0,
+    }
+    missed = ", ".join(bar for bar, met in bars.items() if not met)
+    return (
+        f"{name:<20}{seed:>4}{np.mean(shifts):7.2f}{np.max(shifts):6.1f}{chi2:7.2f}"
+        f"{found.normal_rms_mm:7.2f} ({1e3 * predicted.normal_rms_m:.2f})"
+        f"{found.tilt_deg:7.3f} ({tilt_sigma_deg:.3f})"
+        f"{found.height_mm:7.2f} ({1e3 * predicted.height_sigma_m:.2f})"
+        f"{girths.mean():7.2f}/{girths.max():.2f} ({1e3 * predicted.girth_sigma_m:.2f})"
+        f"{1e3 * solution.rig.residual_rms_m:6.2f}{seconds:6.1f}"
+        f"  {'missed: ' + missed if missed else 'met'}"
+    )
+
+
+def _pairs(booth: SimulatedBooth, solution: Solution) -> tuple[list[float], float]:
+    """Shifts of all pairs in mm, and the normalised squared error a number."""
+    names, truth = list(booth.rig.cameras), booth.rig.cameras
+    shifts = []
+    for i, a in enumerate(names):
+        found, _ = relatives(solution.placed, a, names[i + 1 :])
+        for b, a_from_b in zip(names[i + 1 :], found, strict=True):
+            true = invert(truth[a].world_from_camera) @ truth[b].world_from_camera
+            shifts.append(1e3 * float(np.linalg.norm(twist_between(a_from_b, true)[3:])))
+    others = [name for name in names if name != _REFERENCE]
+    found, covariance = relatives(solution.placed, _REFERENCE, others)
+    away = np.concatenate(
+        [
+            twist_between(
+                pose, invert(truth[_REFERENCE].world_from_camera) @ truth[b].world_from_camera
+            )
+            for b, pose in zip(others, found, strict=True)
+        ]
+    )
+    return shifts, float(away @ np.linalg.solve(covariance, away)) / len(away)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1, help="booths of each case")
+    parser.add_argument("--first", type=int, default=1, help="seed of the first booth")
+    parser.add_argument("--case", action="append", choices=list(CASES), help="only these")
+    parser.add_argument("--images", action="store_true", help="find the ball in rendered images")
+    given = parser.parse_args(arguments)
+    cases = given.case or (list(CASES) if given.images else _DIRECT)
+    print(
+        f"{'violated':<20}{'seed':>4}{'pairs':>7}{'worst':>6}{'chi2/n':>7}"
+        f"{'cloud rms (sigma)':>14}{'tilt deg':>15}{'height mm':>14}{'girths mean/worst':>18}"
+        f"{'held':>6}{'s':>6}"
+    )
+    for name in cases:
+        for seed in range(given.first, given.first + given.seeds):
+            print(judge(name, seed, given.images), flush=True)
+
+
+if __name__ == "__main__":
+    main()
