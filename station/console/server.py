@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from station.console.api.console import Console
 from station.console.app import create_app
@@ -58,10 +59,15 @@ class PatientProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._cancel_head()
-        self._open[self._address] -= 1
-        if not self._open[self._address]:
-            del self._open[self._address]
+        self.release(self._address)
         super().connection_lost(exc)
+
+    @classmethod
+    def release(cls, address: str) -> None:
+        """Forget one connection of an address."""
+        cls._open[address] -= 1
+        if not cls._open[address]:
+            del cls._open[address]
 
     def handle_websocket_upgrade(self, event: Any) -> None:
         self._cancel_head()
@@ -78,6 +84,14 @@ class PatientProtocol(H11Protocol):
     def _too_slow(self) -> None:
         if not self.transport.is_closing():
             self.transport.close()
+
+
+class CountedWebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket: it takes a connection over from `PatientProtocol`, with its count."""
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        PatientProtocol.release(self.client[0] if self.client else "")
 
 
 def check_exposure(config: ConsoleConfig, has_password: bool) -> bool:
@@ -124,7 +138,7 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
         uvicorn.Config(
             create_app(console),
             http=PatientProtocol,
-            ws="websockets-sansio",
+            ws=CountedWebSocket,
             ws_max_size=1 << 10,
             ws_max_queue=2,
             h11_max_incomplete_event_size=_HEAD_BYTES,

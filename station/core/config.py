@@ -97,7 +97,7 @@ class CalibrateConfig(Strict):
         default=0.008,
         gt=0.0,
         le=0.1,
-        description="the same of a girth; half of either limit is remarked upon",
+        description="the same of a girth",
     )
     countdown_s: float = Field(
         default=8.0, ge=0.0, le=60.0, description="to walk into the booth, or out of it"

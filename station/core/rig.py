@@ -21,6 +21,8 @@ FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
 MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
+_MAX_CONTROL_POINTS = 64
+"""Along an axis of a depth field; the solution uses less than twenty."""
 POLYNOMIAL, FIELD = "inverse-depth-poly", "inverse-depth-field"
 """Models of depth correction, beside "none"."""
 _ROTATION_TOLERANCE = 1e-4
@@ -307,7 +309,9 @@ def _field(name: str, fields: Mapping[str, Any]) -> DepthField:
         or knots.shape != control.shape[:1]
         or min(control.shape) < 2
         or min(control.shape[1:]) < 3
+        or max(control.shape) > _MAX_CONTROL_POINTS
         or not np.isfinite(control).all()
+        or not np.isfinite(knots).all()
         or not (np.diff(knots) > 0.0).all()
     ):
         raise ValueError(f"camera {name}: the field of depth_correction is not usable")

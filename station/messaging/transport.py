@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+import time
 from pathlib import Path
 
 import zmq
@@ -19,6 +20,8 @@ _LONGEST_PATH = 100
 MAX_MESSAGE_BYTES = 16 << 20
 STATION_LOCK = "station.lock"
 """Held by `station run` in the runtime folder."""
+_PATIENCE_S = 15.0
+"""Within this a process that hangs is restarted."""
 
 
 class NoAnswerError(BoothError):
@@ -123,3 +126,21 @@ def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> 
             raise NoAnswerError(
                 f"the station's {name} process did not answer within {timeout_s:g} s; {remedy}"
             ) from None
+
+
+def ask_again(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> Reply:
+    """`ask` with a request that may be repeated: asked again while that process runs.
+
+    Raises:
+        NoAnswerError: nobody answered within `_PATIENCE_S`, or nobody is there to answer.
+    """
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return ask(runtime_folder, name, request, timeout_s)
+        except NoAnswerError:
+            alone = not any(
+                is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock")
+            )
+            if alone or time.monotonic() > deadline_s:
+                raise

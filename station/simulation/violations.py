@@ -1,8 +1,8 @@
 """Sensors, balls, floors and helpers that err otherwise than a calibration assumes.
 
 Each violation is a switch of a `SimulatedBooth`. Its parameters are drawn here, from distributions
-that nothing under `station.calibration` reads; the shapes of the errors differ from the terms that
-are solved for.
+that nothing under `station.calibration` reads; their ends lie beyond those of the solution's
+priors, and the shapes of the errors differ from the terms that are solved for.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ BIAS = "bias"
 LENS = "lens"
 """Focal length off by up to 0.2 %, principal point by up to 1 px along each axis."""
 K1 = "k1"
-"""Radial distortion k1 of 0.02 to 0.04, either sign, unknown to the driver."""
+"""Radial distortion k1 of 0.02 to 0.045, either sign, unknown to the driver."""
 FLOOR = "floor"
 """Floor bowed by 2 mm."""
 BALL = "ball"
-"""Ball 0.3 % larger or smaller than stated."""
+"""Ball 0.35 % larger or smaller than stated."""
 OVAL = "oval"
-"""Ball 1 % longer along one axis, which turns with the hand."""
+"""Ball 1.2 % longer along one axis, which turns with the hand."""
 FROZEN = "frozen"
-"""Half of the noise's variance is a pattern that stays from frame to frame."""
+"""Two fifths of the noise's variance are a pattern that stays from frame to frame."""
 HELPER = "helper"
 """A second person at the edge of the booth while the ball is waved."""
 HAND = "hand"
@@ -42,10 +42,10 @@ ALL = (BIAS, LENS, K1, FLOOR, BALL, OVAL, FROZEN, HELPER, HAND, RAW_LAW)
 _BIAS_RMS_M, _BIAS_AT_M = 1.5e-3, 1.7
 _GAIN = (1e-3, 3e-3)
 _FOCAL_SHARE, _CENTER_PX = 2e-3, 1.0
-_K1 = (0.02, 0.04)
+_K1 = (0.02, 0.045)
 _BOW_M = 2e-3
-_BALL_SHARE, _OVAL_SHARE = 3e-3, 1e-2
-_FROZEN_SHARE = 0.5
+_BALL_SHARE, _OVAL_SHARE = 3.5e-3, 1.2e-2
+_FROZEN_SHARE = 0.4
 _RINGS, _BUMPS = 2, 6
 _NORMALISING_GRID = 24
 

@@ -33,12 +33,15 @@ from station.simulation.sensor import SimulatedBooth
 
 _BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 _REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
-_ALL_DIRECT = tuple(v for v in violations.ALL if v not in (violations.HAND, violations.HELPER))
 CASES: dict[str, tuple[str, ...]] = {
     "clean": (),
     "bias": (violations.BIAS,),
     "lens": (violations.LENS,),
     "k1": (violations.K1,),
+    "floor": (violations.FLOOR,),
+    "ball": (violations.BALL,),
+    "oval": (violations.OVAL,),
+    "frozen": (violations.FROZEN,),
     "floor, ball, frozen": (violations.FLOOR, violations.BALL, violations.FROZEN),
     "raw law": (violations.RAW_LAW,),
     "hand, helper": (violations.HAND, violations.HELPER),

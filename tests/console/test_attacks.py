@@ -13,6 +13,9 @@ from xml.etree import ElementTree
 import httpx
 import pytest
 from live_console import API, PASSWORD, LiveConsole
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from station.console.api.console import key_of
 from station.console.api.models import NewScan
@@ -42,6 +45,16 @@ def test_one_address_keeps_nobody_else_out(console: LiveConsole) -> None:
         with suppress(ConnectionResetError):
             assert crowd[-1].recv(100) == b""
         assert other.get("/session").status_code == 200
+
+
+def test_websockets_that_end_are_counted_off(console: LiveConsole) -> None:
+    """Each left its address one connection fewer, until the address was shut out."""
+    url = f"ws://127.0.0.1:{console.port}{API}/pictures"
+    for _ in range(_CROWD):
+        with suppress(InvalidStatus), connect(url, origin=Origin("http://example.com")):
+            pass
+    with console.client() as client:
+        assert client.get("/session").status_code == 200
 
 
 def test_guesses_that_are_sent_all_at_once_count_one_by_one(console: LiveConsole) -> None:

@@ -79,7 +79,9 @@ def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     assert abs(found.height_mm) < 3e3 * predicted.height_sigma_m
 
 
-@pytest.mark.parametrize("switch", [violations.BIAS, violations.K1])
+@pytest.mark.parametrize(
+    "switch", [violations.BIAS, violations.K1, violations.LENS, violations.OVAL]
+)
 def test_errors_of_another_form_are_found(switch: str) -> None:
     """Rings, bumps or a distorted lens once passed for a polynomial: girths were off by 12 mm."""
     procedure = VirtualProcedure(synthetic.booth(121, switches=(switch,)))

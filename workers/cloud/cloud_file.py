@@ -253,8 +253,10 @@ def _ply(path: Path) -> tuple[Array, Faces]:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
     try:
         return read_triangles(path)
-    except (OSError, ValueError):
-        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    except (OSError, ValueError) as cause:
+        raise InputError(
+            f"{path} cannot be read ({cause}); give a .ply or .obj of triangles"
+        ) from None
 
 
 def _obj(path: Path) -> tuple[Array, Faces]:

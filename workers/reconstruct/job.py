@@ -36,6 +36,7 @@ from workers.scape.fit.fit import (
     single_threaded_blas,
 )
 from workers.scape.fit.observer import Observer, unobserved
+from workers.scape.fit.unmatched import patch_sigma_m
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
@@ -159,7 +160,9 @@ def _measured(
     """Measurements as scanned, and in the standard standing pose."""
     with watch.step("measure"):
         sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
-        errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m)
+        errors = ScanErrors(
+            crown_sigma_m=fit.crown_sigma_m, patch_sigma_m=patch_sigma_m(model, fit.patches)
+        )
         if predicted is not None:
             errors = replace(
                 errors,

@@ -30,7 +30,7 @@ from station.core.service import die_with_parent
 from station.messaging.intake import FrameIntake, LiveFrame
 from station.messaging.messages import DesiredState, FrameHeader, Request
 from station.messaging.topics import TOPICS
-from station.messaging.transport import ask, publisher
+from station.messaging.transport import ask_again, publisher
 from station.sensors.base import DeviceInfo
 from station.sensors.clock import DeviceClock
 from station.sensors.recording import check_recording, read_raw
@@ -161,7 +161,7 @@ class Feed:
             CalibrationError: naming the cameras that give none, and why.
         """
         if not self._clocks:
-            answer = ask(
+            answer = ask_again(
                 self._config.runtime.folder,
                 "control",
                 Request("start"),

@@ -26,6 +26,8 @@ from station.core.errors import CalibrationError
 
 _SENSORS_S = 20.0
 _MOST_BOARDS, _MOST_PLACES = 20, 20
+_STAND_M = (0.3, 2.2)
+"""Heights of a stand that cameras of a booth see."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
 """Places of the ball: three that are not on one line show the floor's slope both ways."""
 
@@ -133,13 +135,18 @@ class Procedure:
         """The ball on a stand at as many heights as the operator (or the recordings) likes."""
         if self.recordings is not None:
             for folder in sorted(self.recordings.glob(f"{STAND}-*")):
-                self.stand(1e-3 * float(folder.name.removeprefix(f"{STAND}-")))
+                millimetres = folder.name.removeprefix(f"{STAND}-")
+                self.stand(1e-3 * int(millimetres) if millimetres.isdecimal() else float("nan"))
             return
         while (height_m := self.guide.height_m()) is not None:
             self.stand(height_m)
 
     def stand(self, height_m: float) -> None:
         """The ball on a stand, its underside at a measured height above the floor."""
+        if not _STAND_M[0] <= height_m <= _STAND_M[1]:
+            raise CalibrationError(
+                f"a stand of {height_m:g} m cannot be used: its height is in metres, 0.3 to 2.2"
+            )
         where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
         self._lay(f"{STAND}-{round(1e3 * height_m)}", where)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from station.calibration.adjust.problem import Layout, Problem, State
 from station.calibration.adjust.sensor_model import LENS, POLYNOMIAL, SensorModel, image_place
 from station.calibration.solve.world import Placed
+from station.core.errors import CalibrationError
 from station.core.geometry import invert, skew, transform
 from station.core.lens import pixel_rays, project
 from station.core.rig import CameraCalibration, PredictedError
@@ -34,22 +35,32 @@ _DEPTHS_M = (0.6, 3.0)
 def predict(
     problem: Problem, state: State, placed: Placed, cameras: Mapping[str, CameraCalibration]
 ) -> PredictedError:
-    """Standard deviations of what the calibration adds to a scan; ``cameras`` as solved."""
+    """Standard deviations of what the calibration adds to a scan; ``cameras`` as solved.
+
+    Raises:
+        CalibrationError: no camera sees a height at which a body is measured.
+    """
     layout = Layout.of(problem)
 
-    def normals(points: Array, directions: Array) -> Array:
-        return _rows(problem.model, layout, placed, cameras, points, directions)
+    def seen(points: Array, directions: Array) -> Array:
+        rows = _rows(problem.model, layout, placed, cameras, points, directions)
+        if not len(rows):
+            raise CalibrationError(
+                f"no camera sees {points[0, 2]:.2f} m above the mark: turn a camera there, and "
+                "calibrate again"
+            )
+        return rows
 
     def sigma(row: Array) -> float:
         return float(np.sqrt(max(float(row @ state.covariance @ row), 0.0)))
 
     every, girths = [], []
     for height_m in (*_LEGS_M, *_RINGS_M.values()):
-        rows = normals(*_ring(height_m))
+        rows = seen(*_ring(height_m))
         every.append(rows)
         if height_m in _RINGS_M.values():
             girths.append(sigma(2.0 * np.pi * rows.mean(axis=0)))
-    crown = normals(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0]
+    crown = seen(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0]
     whole = np.concatenate(every)
     variance = np.einsum("ni,ij,nj->n", whole, state.covariance, whole, optimize=True)
     return PredictedError(

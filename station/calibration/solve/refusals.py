@@ -169,7 +169,7 @@ def check_predicted(predicted: PredictedError, limits: Limits, covered: Coverage
         ("heights", predicted.height_sigma_m, limits.height_m),
         ("girths", predicted.girth_sigma_m, limits.girth_m),
     ):
-        if SIGMAS_95 * sigma_m > limit_m:
+        if not SIGMAS_95 * sigma_m <= limit_m:
             more = "" if covered.enough else f"; {covered.advice()}"
             raise CalibrationError(
                 f"by this calibration {what} could be wrong by "

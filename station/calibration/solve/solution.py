@@ -154,11 +154,16 @@ def solve(
     training, tested, found = _tested(problem, poses)
 
     progress("solving with all that was seen")
-    problem = replace(problem, widths=likeliest(training, tested))
-    start = continued(problem, training, tested)
-    state = solve_joint(problem, start, _FINE_ITERATIONS)
-    refusals.check_settled(state)
-    state = averaged(problem, state)
+    try:
+        problem = replace(problem, widths=likeliest(training, tested))
+        start = continued(problem, training, tested)
+        state = solve_joint(problem, start, _FINE_ITERATIONS)
+        refusals.check_settled(state)
+        state = averaged(problem, state)
+    except np.linalg.LinAlgError:
+        # Equations without a solution come from detections that contradict one another.
+        refusals.check_settled(replace(tested, last_step=np.inf))
+        raise
     placed = world.place(problem, state, front_cameras)
     refusals.check_upright(placed)
     refusals.check_slope(placed)

@@ -35,7 +35,7 @@ from station.console.api.models import (
 )
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import command
-from station.core.errors import CalibrationError
+from station.core.errors import BoothError, CalibrationError
 from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
 from station.handover.ledger import Ledger
@@ -239,7 +239,7 @@ def _calibration_in_use(console: Console) -> str:
         return name
     try:
         return Rig.load(store.in_use).created
-    except CalibrationError:
+    except (BoothError, OSError):
         return ""
 
 

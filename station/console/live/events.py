@@ -75,7 +75,9 @@ class EventLog:
             start, _, number = last_id.partition("-")
             if not last_id:
                 return self._number, False
-            if start != self.start or not number.isascii() or not number.isdigit():
+            if start != self.start or not (
+                number.isascii() and number.isdigit() and len(number) < 20
+            ):
                 return self._number, True
             if int(number) > self._number:
                 # Never given: waiting for it would be waiting for ever.

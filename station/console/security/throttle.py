@@ -13,7 +13,7 @@ AT_ONCE = 2
 
 
 class LoginThrottle:
-    """Growing pauses for an address that sends wrong passwords, and for all addresses together."""
+    """Growing pauses for an address that sends wrong passwords."""
 
     def __init__(self) -> None:
         self._failures: OrderedDict[str, tuple[int, float]] = OrderedDict()

@@ -33,7 +33,7 @@ from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
 from workers.scape.fit.sampling import Sampling
-from workers.scape.fit.unmatched import Patch, unmatched_patches, widened
+from workers.scape.fit.unmatched import Patch, unmatched_patches
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
@@ -196,7 +196,6 @@ def fit_overlapping(
     poses = cameras.poses(scan.views)
     crown_sigma = crown_sigma_m(model, scan.views, poses, surface.vertices, cloud.points)
     patches = unmatched_patches(model, surface.vertices, cloud)
-    surface = replace(surface, sigma_m=widened(model, surface.sigma_m, patches))
     return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),

@@ -81,14 +81,14 @@ def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> t
     return tuple(sorted(patches, key=lambda patch: -patch.area_m2))
 
 
-def widened(model: BodyModel, sigma_m: Array, patches: Sequence[Patch]) -> Array:
-    """Standard deviations (P,) of a surface, with what its unmatched patches add around them: there
-    the skin is as far off as the patch."""
-    found = sigma_m.copy()
+def patch_sigma_m(model: BodyModel, patches: Sequence[Patch]) -> Array:
+    """Standard deviations (P,) that unmatched patches add around them: there the skin is as far off
+    as the patch, metres."""
+    found = np.zeros(model.vertex_count)
     for patch in patches:
         if patch.area_m2 < _LEAST_WIDENED_M2 or patch.distance_m > ELSEWHERE_M:
             continue
-        around = np.zeros(len(sigma_m))
+        around = np.zeros(len(found))
         around[patch.vertices] = 1.0
         for _ in range(_WIDENED_RINGS):
             around += model.adjacency @ around

@@ -188,12 +188,14 @@ def judge(
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
             halved = True
     missing = [name for name in lost if name]
+    unseen: set[str] = set()
     for part in parts:
         found = _part_reasons(part)
         reasons += found
         if found:
             missing.append(part.name)
-    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= set(missing) for side in _LIMBS)
+            unseen.add(part.name)
+    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
     if halved:
         missing += [
             part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
