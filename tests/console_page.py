@@ -5,14 +5,24 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from live_console import PASSWORD, LiveConsole
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    Error,
+    Locator,
+    Page,
+    Playwright,
+    expect,
+    sync_playwright,
+)
 
 LONG_MS = 120_000
 """Patience with a machine that does much else; no test is about speed."""
+_LAUNCHES = 3
 _SIZE = {"width": 1024, "height": 768}
 _ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -29,13 +39,21 @@ _MOVING = """async () => {
 }"""
 
 
+def _launched(playwright: Playwright, chromium: str) -> Browser:
+    """A running chromium; on a busy machine it sometimes dies by itself (SIGTRAP) at its start."""
+    for _ in range(_LAUNCHES - 1):
+        with suppress(Error):
+            return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
+    return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
+
+
 @contextmanager
 def browser() -> Iterator[Browser]:
     """Debian's chromium without a display."""
     chromium = shutil.which("chromium")
     assert chromium, "chromium is missing; make test installs it where it may: apt install chromium"
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
+        started = _launched(playwright, chromium)
         yield started
         started.close()
 
