@@ -120,7 +120,7 @@ def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> 
         except zmq.Again:
             remedy = (
                 "a process that hangs is restarted; try again in 15 s"
-                if any(is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock"))
+                if _is_running(runtime_folder, name)
                 else "is it running? start it with: station run"
             )
             raise NoAnswerError(
@@ -139,8 +139,10 @@ def ask_again(runtime_folder: Path, name: str, request: Request, timeout_s: floa
         try:
             return ask(runtime_folder, name, request, timeout_s)
         except NoAnswerError:
-            alone = not any(
-                is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock")
-            )
-            if alone or time.monotonic() > deadline_s:
+            if not _is_running(runtime_folder, name) or time.monotonic() > deadline_s:
                 raise
+
+
+def _is_running(runtime_folder: Path, name: str) -> bool:
+    """Whether a process runs, or a supervisor that restarts it."""
+    return any(is_held(runtime_folder / lock) for lock in (STATION_LOCK, f"{name}.lock"))

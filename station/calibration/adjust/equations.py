@@ -189,8 +189,6 @@ class Planes:
     """(10, U)"""
     theta_matrix: Array
     theta_gradient: Array
-    misfit: float
-    """Mean squared residual in units of the expected variance."""
 
 
 def plane_equations(
@@ -210,8 +208,7 @@ def plane_equations(
     change = model.change(parameters, measured, surface.place)
     residual = surface.inverse + change - expected
     squared = surface.weight * residual**2
-    misfit = float(np.median(squared) / _MEDIAN_SQUARE)
-    spread = max(1.0, misfit)
+    spread = max(1.0, float(np.median(squared) / _MEDIAN_SQUARE))
     size = np.sqrt(squared / spread)
     weight = surface.weight / spread * np.minimum(1.0, _HUBER / np.maximum(size, _HUBER))
     jacobian = np.concatenate([-towards, -raised], axis=1)
@@ -228,7 +225,6 @@ def plane_equations(
         mixed[0],
         theta_matrix,
         theta_gradient,
-        misfit,
     )
 
 
