@@ -24,7 +24,7 @@ _HEAD_S = 10.0
 """A request's head has to arrive within this; a slow sender cannot hold a connection open."""
 _HEAD_BYTES = 16 << 10
 _MAX_CONNECTIONS = 200
-_MOST_OF_ONE_ADDRESS = 64
+_MAX_OF_ONE_ADDRESS = 64
 """A tablet opens less than ten; whoever opens more keeps nobody else out."""
 _STOP_S = 2
 _SEND_BYTES = 128 << 10
@@ -43,7 +43,7 @@ class PatientProtocol(H11Protocol):
         self._head_timer: asyncio.TimerHandle | None = None
         self._address = self.client[0] if self.client else ""
         self._open[self._address] += 1
-        if self._open[self._address] > _MOST_OF_ONE_ADDRESS:
+        if self._open[self._address] > _MAX_OF_ONE_ADDRESS:
             transport.abort()
             return
         self._expect_head()

@@ -44,7 +44,7 @@ NOT_SHOWN = re.compile(
 )
 """Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
 _SILENT_CALLS = ("log.", "_log.", "click.", "Field", "Query", "audit.note")
-_LEAST_WORDS = 3
+_MIN_WORDS = 3
 _GAP = "7"
 
 
@@ -72,7 +72,7 @@ def _sentences(path: Path) -> Iterator[str]:
             passed.update(id(inner) for inner in ast.walk(node) if inner is not node)
     for node in ast.walk(tree):
         text = _template(node) if id(node) not in passed else None
-        if text is not None and len(text.split()) >= _LEAST_WORDS and text == text.strip():
+        if text is not None and len(text.split()) >= _MIN_WORDS and text == text.strip():
             yield text
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
 from workers.cloud.floor import UNITS_M, check_units, standing_on
-from workers.cloud.observed import LEAST_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
+from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 from workers.cloud.ply import read_points, read_triangles
 
 Array = NDArray[np.float64]
@@ -109,8 +109,8 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
     points = np.asarray(cloud.points)
     if not len(points):
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
-    if len(points) < LEAST_POINTS:
-        raise InputError(f"{path} has {len(points)} points; a body needs {LEAST_POINTS}")
+    if len(points) < MIN_POINTS:
+        raise InputError(f"{path} has {len(points)} points; a body needs {MIN_POINTS}")
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not numbers; repair it")
     if len(points) > _MAX_POINTS:

@@ -13,7 +13,7 @@ from station.core.rig import CameraCalibration, PredictedError
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LEAST_POINTS = 1500
+MIN_POINTS = 1500
 """Fewer points do not show a body."""
 POSSIBLE_HEIGHTS_M = (1.0, 2.6)
 """A cloud that is lower or higher than this is not a standing person in metres."""

@@ -51,7 +51,7 @@ _BESIDE_M = 0.015
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
-_LEAST_TYPICAL = 0.2
+_MIN_TYPICAL = 0.2
 """Least typical deviation, as a share of the noise's variance."""
 MEDIAN = 2.366
 """Median of chi-square with three degrees of freedom."""
@@ -312,7 +312,7 @@ def _robust_weight(deviation: Array) -> Array:
     Once they are most deviate by less than the noise that is assumed: fingers over the ball then
     show, although they deviate by no more than that noise could.
     """
-    typical = max(float(np.median(deviation)) / MEDIAN, _LEAST_TYPICAL)
+    typical = max(float(np.median(deviation)) / MEDIAN, _MIN_TYPICAL)
     deviation = deviation / typical
     far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
     return np.where(deviation < _REJECT, far, 0.0)

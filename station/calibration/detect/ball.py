@@ -36,8 +36,8 @@ _FOREGROUND = 0.02
 _START_GATE_M = 0.03
 _GATE_SIGMAS = 3.5
 _STRAY_ROUNDS = 4
-_LEAST_PIXELS = 150
-_LEAST_VISIBLE = 0.45
+_MIN_PIXELS = 150
+_MIN_VISIBLE = 0.45
 _LARGEST_SPREAD = 2.0
 _OPEN_RING_SHARE = 0.5
 _RADIUS_TOLERANCE = 0.4
@@ -122,7 +122,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
     # The radius is free until the place is found: a ball of another size shall be told.
     for round_ in range(8):
         normal, pull, used, seen = normal_equations(part, ray, center, radius, gate, False)
-        if used < _LEAST_PIXELS:
+        if used < _MIN_PIXELS:
             return None
         step = np.linalg.solve(normal, pull)
         center, radius = center + step[:3], radius + step[3]
@@ -138,7 +138,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
         clean = np.where(off, np.float32(0.0), part)
         for _ in range(2):
             normal, pull, used, seen = normal_equations(clean, ray, center, radius, gate, False)
-            if used < _LEAST_PIXELS:
+            if used < _MIN_PIXELS:
                 return None
             step = np.linalg.solve(normal, pull)
             center, radius = center + step[:3], radius + step[3]
@@ -147,7 +147,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
     fixed = radius_m if abs(free_radius - radius_m) < 0.1 * radius_m else free_radius
     for _ in range(4):
         normal, pull, used, seen = normal_equations(clean, ray, center, fixed, gate, True)
-        if used < _LEAST_PIXELS:
+        if used < _MIN_PIXELS:
             return None
         center = center + np.linalg.solve(normal[:3, :3], pull[:3])
     if not _is_ball(part, ray, center, fixed, used, seen):
@@ -180,7 +180,7 @@ def _window(camera: CameraCalibration, center: Array, reach_m: float) -> tuple[s
 
 def _is_ball(part: Image, ray: Image, center: Array, radius: float, used: int, seen: int) -> bool:
     """Enough of it is seen, and around it one sees past it."""
-    if used < _LEAST_VISIBLE * seen:
+    if used < _MIN_VISIBLE * seen:
         return False
     ring, beyond = surroundings(part, ray, center, radius)
     return bool(ring.any() and beyond[ring].mean() > _OPEN_RING_SHARE)

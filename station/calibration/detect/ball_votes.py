@@ -26,8 +26,8 @@ _CELL_M = 0.03
 _NEAR_M = 0.045
 """Votes this near to one another may be for one ball."""
 _CANDIDATES = 8
-_LEAST_VOTES = 8
-_LEAST_VOTE_SHARE = 0.2
+_MIN_VOTES = 8
+_MIN_VOTE_SHARE = 0.2
 _AROUND_WEIGHT = 0.3
 """A plane fills 9 cells of 3^3 and 49 of 7^3, so anything above 9/49 cancels it."""
 
@@ -55,7 +55,7 @@ def candidates(
     # What is near covers more pixels: votes count as a share of what a ball there would give.
     depths = np.maximum(low[2] + (np.arange(shape[2]) + 0.5) * _CELL_M, 0.3).astype(np.float32)
     alone = close - _AROUND_WEIGHT * around
-    smooth = np.where((close >= _LEAST_VOTES) & (alone > 0.0), alone * depths**2, 0.0)
+    smooth = np.where((close >= _MIN_VOTES) & (alone > 0.0), alone * depths**2, 0.0)
     K = camera.K
     found: list[Array] = []
     for _ in range(_CANDIDATES):
@@ -68,7 +68,7 @@ def candidates(
             if near.any():
                 center = votes[near].mean(axis=0)
         whole = np.pi * (radius_m / max(center[2], 0.3)) ** 2 * K[0, 0] * K[1, 1] / _STEP_PX**2
-        if near.sum() > _LEAST_VOTE_SHARE * whole:
+        if near.sum() > _MIN_VOTE_SHARE * whole:
             found.append(center)
         smooth[tuple(slice(max(i - 2, 0), i + 3) for i in peak)] = 0.0
     return found

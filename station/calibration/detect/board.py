@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 
 WORKING_DISTANCE_M = 1.7
 """Distance of the person from a camera."""
-_LEAST_CORNERS = 8
-_LEAST_MARKERS = 4
-_LEAST_VIEWS = 12
+_MIN_CORNERS = 8
+_MIN_MARKERS = 4
+_MIN_VIEWS = 12
 _OTHER_LAYOUT_PX = 6.0
 _CERTAIN_M = 0.0015
 """A lens has to be known so well, in 95 % of the image, at the working distance."""
@@ -110,8 +110,8 @@ class LensReport:
 
     def words(self) -> str:
         start = f"camera {self.camera}: {self.views} views"
-        if self.views < _LEAST_VIEWS:
-            return f"{start}; the factory's lens is kept, {_LEAST_VIEWS} are needed to judge it"
+        if self.views < _MIN_VIEWS:
+            return f"{start}; the factory's lens is kept, {_MIN_VIEWS} are needed to judge it"
         figures = (
             f"held-out corners {1e3 * self.factory_m:.2f} mm off with the factory's lens, "
             f"{1e3 * self.free_m:.2f} mm with one from the board, which is certain to "
@@ -138,7 +138,7 @@ def find_board(image: NDArray[np.uint8], board: Board, moment: str) -> BoardView
     if np.size(marker_ids) > 1:
         numbers = np.array(marker_ids, np.int64).ravel()
         _check_layout(board, moment, np.array(markers, np.float64), numbers)
-    if np.size(ids) < _LEAST_CORNERS:
+    if np.size(ids) < _MIN_CORNERS:
         return None
     return BoardView(
         moment, np.asarray(ids, np.int64).ravel(), np.asarray(corners, np.float64).reshape(-1, 2)
@@ -159,7 +159,7 @@ def _check_layout(board: Board, moment: str, pixels: Array, ids: NDArray[np.inte
             f"image {moment} shows markers {strange[0]}, {strange[1]}: {another}"
         )
     known = [index for index, number in enumerate(ids.tolist()) if number in places]
-    if len(known) < _LEAST_MARKERS:
+    if len(known) < _MIN_MARKERS:
         return
     flat = np.concatenate([np.asarray(places[ids[index]])[:, :2] for index in known])
     seen = pixels[known].reshape(-1, 2)
@@ -171,7 +171,7 @@ def _check_layout(board: Board, moment: str, pixels: Array, ids: NDArray[np.inte
 
 def judge_lens(camera: CameraCalibration, views: Sequence[BoardView], board: Board) -> LensReport:
     """Judge whether the views give a better lens than the factory's, on held-out views."""
-    if len(views) < _LEAST_VIEWS:
+    if len(views) < _MIN_VIEWS:
         return LensReport(camera.name, len(views), np.nan, np.nan, np.nan, None)
     held_out = views[::_HELD_OUT_EVERY]
     used = [view for index, view in enumerate(views) if index % _HELD_OUT_EVERY]

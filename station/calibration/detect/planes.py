@@ -34,14 +34,14 @@ _UNEVEN_FLOOR_M, _UNEVEN_BOARD_M = 5e-4, 2e-4
 by 2 mm over 0.1 m), ..."""
 _BUMP_M2 = 2.0 * np.pi * 0.1**2
 """... in bumps of this size: what one camera sees of a bump errs all alike."""
-_LEAST_PATCHES = 40
-_LEAST_SHARE = 0.3
+_MIN_PATCHES = 40
+_MIN_SHARE = 0.3
 _FOREGROUND = 0.015
 _LARGEST_SHARE_BEYOND = 0.05
 _FARTHEST_M = 3.2
 _WHOLE_PX = 3
-_LEAST_WHOLE = 2
-_LEAST_WHOLE_SHARE = 0.6
+_MIN_WHOLE = 2
+_MIN_WHOLE_SHARE = 0.6
 """Least share of the frames without gaps: else readings between gaps are too near as well."""
 
 
@@ -89,7 +89,7 @@ def _whole_mean(stack: NDArray[np.uint16], scale_m: float) -> tuple[Image, Image
         whole = cv2.erode((frame > 0).astype(np.uint8), window)
         total += frame * whole
         count += whole
-    usable = count >= np.maximum(_LEAST_WHOLE, _LEAST_WHOLE_SHARE * len(stack))
+    usable = count >= np.maximum(_MIN_WHOLE, _MIN_WHOLE_SHARE * len(stack))
     return (
         np.where(usable, scale_m * total / np.maximum(count, 1), 0.0).astype(np.float32),
         np.where(usable, count, 1.0).astype(np.float32),
@@ -112,7 +112,7 @@ def _observe(
     cosine = np.abs(ray @ plane) / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(plane))
     on_plane = usable & (np.abs(inverse - ray @ plane) < gate) & (cosine > _INCIDENCE_COSINE)
     patches = _patches(inverse, on_plane, cosine, count, camera, surface)
-    if len(patches) < _LEAST_PATCHES:
+    if len(patches) < _MIN_PATCHES:
         return None
     return PlaneObservation(camera.name, surface, int(on_plane.sum()), patches)
 
@@ -162,7 +162,7 @@ def _patches(
     v, u = np.nonzero(on_plane[: height * _CELL_PX, : width * _CELL_PX])
     cell = (v // _CELL_PX) * width + u // _CELL_PX
     size = np.bincount(cell, minlength=height * width)
-    kept = np.flatnonzero(size >= _LEAST_SHARE * _CELL_PX**2)
+    kept = np.flatnonzero(size >= _MIN_SHARE * _CELL_PX**2)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(cell, values, minlength=len(size))[kept] / size[kept])

@@ -25,7 +25,7 @@ VERSION = 1
 SMOOTHING_PX = 3.0
 """The noise is measured, and edges are compared, after a Gaussian of this width."""
 _MOSTLY = 0.5
-_LEAST_SHARE = 0.2
+_MIN_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def smoothed(inverse: Image, share: Image) -> tuple[Image, Image]:
     """Smoothed images: of the surface, over its readings alone, and with 0 for no reading."""
     with_gaps = np.asarray(cv2.GaussianBlur(inverse, (0, 0), SMOOTHING_PX), np.float32)
     there = cv2.GaussianBlur(share, (0, 0), SMOOTHING_PX)
-    return np.asarray(with_gaps / np.maximum(there, _LEAST_SHARE), np.float32), with_gaps
+    return np.asarray(with_gaps / np.maximum(there, _MIN_SHARE), np.float32), with_gaps
 
 
 def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticView:

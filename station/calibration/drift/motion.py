@@ -64,7 +64,7 @@ _CHANGED_PER_M, _CHANGED_PX = 0.03, 6.0
 """A larger difference, or a shift beyond so many pixels, is not a moved camera but a person."""
 _SHADOW_CELLS = 2
 """The outline of a person, and of the shadow that the projector casts behind, in strides."""
-_LEAST_SHARE = 0.15
+_MIN_SHARE = 0.15
 _COARSE_SIGMA_M, _FINE_SIGMA_M = 0.02, 0.2
 """Directions that nothing shows must not wander: first by less than an outline can follow."""
 _ITERATIONS = 10
@@ -86,7 +86,7 @@ class CameraMove:
     @property
     def lost(self) -> bool:
         """Too little of the stored background is met for any estimate."""
-        return self.share < _LEAST_SHARE
+        return self.share < _MIN_SHARE
 
     @property
     def moved(self) -> bool:
@@ -269,7 +269,7 @@ def estimate_move(
     ):
         same = samples & ~_changed(reference, now, xi)
         met = float(same.sum() / max(1, samples.sum()))
-        if met < _LEAST_SHARE:
+        if met < _MIN_SHARE:
             return CameraMove(reference.camera.name, np.zeros(6), np.eye(6), met)
         xi, covariance = _align(reference, now, variance, same, xi, sigma_m)
     return CameraMove(reference.camera.name, xi, covariance, met)

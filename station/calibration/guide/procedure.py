@@ -25,7 +25,7 @@ from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
 
 _SENSORS_S = 20.0
-_MOST_BOARDS, _MOST_PLACES = 20, 20
+_MAX_BOARDS, _MAX_PLACES = 20, 20
 _STAND_M = (0.3, 2.2)
 """Heights of a stand that cameras of a booth see."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
@@ -118,7 +118,7 @@ class Procedure:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
         session = self.begun()
         before = session.around_count if session and self.recordings is None else 0
-        for place in range(before, before + _MOST_PLACES):
+        for place in range(before, before + _MAX_PLACES):
             step = f"{AROUND}-{place}"
             if self.recordings is not None:
                 if not (self.recordings / step).is_dir():
@@ -157,7 +157,7 @@ class Procedure:
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
         before = session.wall_count if session and self.recordings is None else 0
-        for place in range(before, before + _MOST_BOARDS):
+        for place in range(before, before + _MAX_BOARDS):
             if self.recordings is not None:
                 if not (self.recordings / f"{WALL}-{place}").is_dir():
                     return

@@ -28,7 +28,7 @@ LARGEST_MEAN_M = 0.0025
 """Largest mean of a camera's held-out detections, in which the noise averages out."""
 _A_SECOND = 10.0
 """Detections of a held-out second, which share the errors of one region."""
-_LEAST = 6
+_MIN_DETECTIONS = 6
 """Fewer comparisons prove nothing."""
 
 
@@ -43,7 +43,7 @@ class HeldOut:
 
     @property
     def tested(self) -> bool:
-        return self.detections >= _LEAST
+        return self.detections >= _MIN_DETECTIONS
 
     @property
     def acceptable(self) -> bool:
@@ -75,7 +75,7 @@ def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
         chosen = held_out(problem.waved[name].times_s, start_s)
         away = _differences(track, chosen, [tracks[other] for other in tracks if other != name])
         calm = away[np.linalg.norm(away, axis=1) < 5.0 * _typical(away)] if len(away) else away
-        if len(calm) < _LEAST:
+        if len(calm) < _MIN_DETECTIONS:
             found[name] = HeldOut(len(calm), 0.0, np.zeros(3))
         else:
             rms = float(np.sqrt(np.mean(np.sum(calm**2, axis=1))))

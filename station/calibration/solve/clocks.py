@@ -19,7 +19,7 @@ from station.core.geometry import transform
 Array = NDArray[np.float64]
 
 _WINDOW_S = 4.0
-_LEAST_IN_WINDOW_S = 0.8
+_MIN_IN_WINDOW_S = 0.8
 _LONGEST_SHIFT_S = 3.0
 _SHORTEST_SHIFT_S = 0.15
 """In this time the ball travels farther than depth errors reach: shorter jumps are found only
@@ -31,7 +31,7 @@ _AGREEING = 0.6
 _GAIN = 0.3
 """Least gain in the share of agreeing matches once a clock is shifted."""
 _CUT_STEP_S = 2.0
-_LEAST_ON_A_SIDE_S = 2.5
+_MIN_ON_A_SIDE_S = 2.5
 _COUNTED_S = 0.1
 """Detections count once in so long: how long a camera errs does not depend on its rate."""
 _SPEED_SPAN_S = 0.05
@@ -106,7 +106,7 @@ def moved_camera(tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pa
             for key, pair in pairs.items():
                 early = pair.times_s < cut_s
                 sides = (_seen_s(pair.times_s[side]) for side in (early, ~early))
-                if name in key and min(sides) >= _LEAST_ON_A_SIDE_S:
+                if name in key and min(sides) >= _MIN_ON_A_SIDE_S:
                     drops[key] = float(pair.agree[early].mean() - pair.agree[~early].mean())
             drop = float(np.median(np.abs(list(drops.values())))) if len(drops) >= 2 else 0.0
             if drop > largest and _stands_elsewhere(tracks, drops, cut_s):
@@ -141,9 +141,9 @@ def _window_shifts(a: Track, b: Track, pair: Pair) -> list[tuple[float, bool]]:
     for start in np.arange(pair.times_s.min(), pair.times_s.max(), _WINDOW_S):
         inside = (pair.times_s >= start) & (pair.times_s < start + _WINDOW_S)
         window = (a.times_s >= start) & (a.times_s < start + _WINDOW_S)
-        known = _seen_s(pair.times_s[inside]) >= _LEAST_IN_WINDOW_S
+        known = _seen_s(pair.times_s[inside]) >= _MIN_IN_WINDOW_S
         before = float(pair.agree[inside].mean()) if known else 0.0
-        if _seen_s(a.times_s[window]) < _LEAST_IN_WINDOW_S or before > _AGREEING:
+        if _seen_s(a.times_s[window]) < _MIN_IN_WINDOW_S or before > _AGREEING:
             continue
         shares = [_agreement(a, b, pair.a_from_b, window, float(shift)) for shift in shifts]
         best = int(np.argmax(shares))
@@ -156,7 +156,7 @@ def _agreement(
     a: Track, b: Track, a_from_b: Array, window: NDArray[np.bool_], shift: float
 ) -> float:
     places, known = b.at(a.times_s[window] + shift)
-    if _seen_s(a.times_s[window][known]) < _LEAST_IN_WINDOW_S:
+    if _seen_s(a.times_s[window][known]) < _MIN_IN_WINDOW_S:
         return 0.0
     away = np.linalg.norm(a.points[window] - transform(a_from_b, places), axis=1)
     return float(np.mean(away[known] < GATE_M))
@@ -183,7 +183,7 @@ def _step(measured: tuple[Array, Array, Array], cut_s: float) -> tuple[float, fl
     """Change of the lateness at the cut, and its standard deviation."""
     times, pulled, known = measured
     early = times < cut_s
-    if min(_seen_s(times[side]) for side in (early, ~early)) < _LEAST_ON_A_SIDE_S:
+    if min(_seen_s(times[side]) for side in (early, ~early)) < _MIN_ON_A_SIDE_S:
         return None
     lateness = [pulled[side].sum() / known[side].sum() for side in (early, ~early)]
     variance = sum(_NOISE_M**2 / known[side].sum() for side in (early, ~early))

@@ -26,7 +26,7 @@ shares of the radius. With a hand over the ball and a second person in the booth
 detections were off by more than 5 mm, of those within both limits 1 %."""
 _RADIUS_SLACK = 0.10
 """Distance from the stated radius: a depth error of 1 % changes it by 1 %."""
-_LEAST_AT_REST = 5
+_MIN_AT_REST = 5
 _PATH_WEIGHT = 1e6
 """1/m^2: a first path passes its points within a millimetre, ..."""
 _SINGLE_WEIGHT = 6e4
@@ -109,11 +109,11 @@ def at_rest(
 ) -> Sightings | None:
     """A camera's detections of a resting ball that agree with their median."""
     own = sorted_detections(detections, [camera.name], radius_m, held=False)[camera.name]
-    if len(own.waved) < _LEAST_AT_REST:
+    if len(own.waved) < _MIN_AT_REST:
         return None
     middle = np.median(own.track.points, axis=0)
     near = np.linalg.norm(own.track.points - middle, axis=1) < _REST_GATE_M
-    if near.sum() < _LEAST_AT_REST:
+    if near.sum() < _MIN_AT_REST:
         return None
     return Sightings.of(camera, [d for d, good in zip(own.waved, near, strict=True) if good])
 

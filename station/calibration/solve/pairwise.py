@@ -23,7 +23,7 @@ LONGEST_GAP_S = 0.15
 _TRIALS = 400
 GATE_M = 0.045
 """Two cameras' depth errors together, before they are corrected."""
-LEAST_MATCHES = 30
+MIN_MATCHES = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def match(a: Track, b: Track, shift_s: float = 0.0) -> tuple[Array, Array, Array
 def relate(a: Track, b: Track, seed: int = 0) -> Pair | None:
     """The transform that most matches agree upon; None with too few matches."""
     times, in_a, in_b = match(a, b)
-    if len(times) < LEAST_MATCHES:
+    if len(times) < MIN_MATCHES:
         return None
     rng = np.random.default_rng(seed)
     best, most = None, 2
@@ -100,7 +100,7 @@ def relate_all(tracks: Mapping[str, Track]) -> dict[tuple[str, str], Pair]:
     found = {}
     for a, b in combinations(tracks, 2):
         pair = relate(tracks[a], tracks[b])
-        if pair is not None and pair.agree.sum() >= LEAST_MATCHES:
+        if pair is not None and pair.agree.sum() >= MIN_MATCHES:
             found[a, b] = pair
     return found
 

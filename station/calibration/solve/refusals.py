@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 _RADIUS_SHARE = 0.04
 """Largest deviation of the measured radius; a depth error of 1 % changes it by 1 %."""
-_LEAST_DETECTIONS = 60
+_MIN_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
 _LARGEST_SCATTER = 3.0
 SETTLED, LOST = 0.3, 10.0
@@ -52,9 +52,9 @@ def check_counts(covered: Coverage) -> None:
     if not any(covered.counts().values()):
         raise CalibrationError("the ball has not been waved yet: station calibrate ball")
     for name, count in covered.counts().items():
-        if count < _LEAST_DETECTIONS:
+        if count < _MIN_DETECTIONS:
             raise CalibrationError(
-                f"camera {name} saw the ball in {count} frames only ({_LEAST_DETECTIONS} are "
+                f"camera {name} saw the ball in {count} frames only ({_MIN_DETECTIONS} are "
                 f"needed): check that the camera works and is not covered, and wave the ball "
                 f"where {name} looks"
             )

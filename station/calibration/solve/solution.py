@@ -43,7 +43,7 @@ from station.core.rig import CameraCalibration, Rig
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-_LEAST_SPREAD_M = 0.15
+_MIN_SPREAD_M = 0.15
 """Least rms distance of the resting ball's places from one line, where no camera sees the floor."""
 _FINE_ITERATIONS = 16
 _GOOD_SLOPE_RAD = np.radians(0.06)
@@ -241,7 +241,7 @@ def _problem(
     if not any(surface.surface == FLOOR for surface in surfaces):
         laid = {place: seen for place, seen in resting.items() if place not in heights_m}
         spread = spread_m(np.array(list(resting_places(laid, poses).values())))
-        if spread < _LEAST_SPREAD_M:
+        if spread < _MIN_SPREAD_M:
             raise CalibrationError(
                 "no camera saw enough of the floor, and the ball did not lie on it at three "
                 f"places away from one line: {refusals.AROUND_WORDS}"

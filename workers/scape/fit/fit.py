@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from station.core.errors import InputError
 from workers.cloud.observed import (
-    LEAST_POINTS,
+    MIN_POINTS,
     POSSIBLE_HEIGHTS_M,
     CameraView,
     Finding,
@@ -58,7 +58,7 @@ _START_POINTS, _START_SAMPLES = 800, 250
 """Points of the cloud and vertices of the model that starting poses are compared with."""
 _FACING_EVERY = 10
 """Every so many points are used to find the direction that the toes point in."""
-_MOST_STARTS = 4
+_MAX_STARTS = 4
 """Starting poses that are tried at most."""
 _RIM_EVERY = 8
 """Every so many vertices of a hand are used to find it in an image."""
@@ -272,7 +272,7 @@ def _best_start(
     """Fit from the best start, and from others as long as too many points stay unexplained."""
     best, least = None, np.inf
     cameras = CameraCorrections.build(cloud, views)
-    for start in starts[:_MOST_STARTS]:
+    for start in starts[:_MAX_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
         left = unexplained_share(model, coarse.vertices, cloud)
         if left < least:
@@ -312,8 +312,8 @@ def _check(cloud: PointCloud) -> None:
         raise InputError(
             "the cloud holds values that are not numbers; repair the file or scan again"
         )
-    if len(cloud) < LEAST_POINTS:
-        raise InputError(f"the cloud has {len(cloud)} points; a body needs {LEAST_POINTS}")
+    if len(cloud) < MIN_POINTS:
+        raise InputError(f"the cloud has {len(cloud)} points; a body needs {MIN_POINTS}")
     height_m = float(np.ptp(cloud.points[:, 2]))
     if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(

@@ -17,7 +17,7 @@ from workers.scape.model.sampled import twist_chain
 
 Array = NDArray[np.float64]
 
-_MOST_TURN_RAD = 0.5
+_MAX_TURN_RAD = 0.5
 """Largest rotation increment about each axis in one step: derivatives are of first order."""
 _TWIST_INFLATION = 1.5
 """Standard deviations of people's poses over those of the training poses."""
@@ -75,7 +75,7 @@ def shape_parameters(model: BodyModel, active: int) -> slice:
 
 def updated(state: BodyState, delta: Array, shape: slice) -> BodyState:
     """State after a step (D,), with each rotation increment limited."""
-    turns = np.clip(delta[: shape.start].reshape(-1, 3), -_MOST_TURN_RAD, _MOST_TURN_RAD)
+    turns = np.clip(delta[: shape.start].reshape(-1, 3), -_MAX_TURN_RAD, _MAX_TURN_RAD)
     beta = state.beta.copy()
     beta[: shape.stop - shape.start] += delta[shape]
     translation = state.translation + delta[shape.stop : shape.stop + 3]

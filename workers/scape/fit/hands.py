@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 _SAMPLES, _POINTS = 130, 260
 """Vertices of a hand, and points of the cloud, that are compared."""
-_LEAST_POINTS = 25
+_MIN_POINTS = 25
 """Points below which a hand stays as it is."""
 _REACH_M = 0.23
 """Radius around the wrist within which points can belong to the hand: the longest hands."""
@@ -44,7 +44,7 @@ _ROUNDS = (96, 64, 48, 32)
 """Poses that are tried in each round."""
 _ELITE = 8
 """Best poses of a round, whose mean and spread the next round samples from."""
-_LEAST_SPREAD = 0.02
+_MIN_SPREAD = 0.02
 """Added to this spread, in standard deviations, so that the search does not freeze."""
 _CURL = 2.0
 """Factor of the prior's widest direction, the closing of the fingers: people make fists, the
@@ -113,7 +113,7 @@ def place_hands(
 
     def searched(hand: Hand) -> BodyState:
         points, directions = _beyond_wrist(model, hand, cloud, vertices, tree)
-        if len(points) < _LEAST_POINTS:
+        if len(points) < _MIN_POINTS:
             return state
         return _searched(model, hand, state, normals, points, directions)
 
@@ -174,7 +174,7 @@ def _searched(
         if cost[order[0]] < least:
             best, least = tried[order[0]], float(cost[order[0]])
         elite = tried[order[:_ELITE]]
-        center, width = elite.mean(axis=0), elite.std(axis=0) + _LEAST_SPREAD
+        center, width = elite.mean(axis=0), elite.std(axis=0) + _MIN_SPREAD
     rotations = _rotations(model, hand, state, (hand.mean + hand.spread @ best)[None])
     turned = state.rotations.copy()
     turned[list(hand.parts)] = rotations[0]

@@ -40,13 +40,13 @@ _BODY_TRIM_M = 0.08
 """Largest distance that counts of a vertex: not all of the body is seen."""
 _STATURE_COMPONENTS = 40
 """Shape components that are used for the stature: they hold nearly all of it."""
-_MOST_BETA_NORM = 3.5
+_MAX_BETA_NORM = 3.5
 """Largest length of beta at the start."""
 _STATURE_QUANTILE = 0.9995
 """Quantile of the points' heights that is taken for the stature."""
 _TRUNK_HEIGHTS = (0.35, 0.75)
 """Heights of the trunk, as shares of the stature."""
-_LEAST_TRUNK_POINTS = 50
+_MIN_TRUNK_POINTS = 50
 
 _Try = tuple[tuple[float, float], tuple[float, float], float]
 """Degrees: arms from the trunk (left, right), arms swung back (left, right), heading."""
@@ -90,7 +90,7 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
     excess = stature_m - float(model.mean[top, 2] - model.mean[sole, 2])
     beta = gradient * excess / float(gradient @ gradient)
     norm = float(np.linalg.norm(beta))
-    return beta * min(1.0, _MOST_BETA_NORM / max(norm, 1e-9))
+    return beta * min(1.0, _MAX_BETA_NORM / max(norm, 1e-9))
 
 
 def starting_states(
@@ -110,7 +110,7 @@ def starting_states(
     state = replace(model.neutral_state(), beta=stature_beta(model, stature))
     low, high = (share * stature for share in _TRUNK_HEIGHTS)
     trunk = points[(points[:, 2] > low) & (points[:, 2] < high)]
-    center = np.median(trunk if len(trunk) > _LEAST_TRUNK_POINTS else points, axis=0)
+    center = np.median(trunk if len(trunk) > _MIN_TRUNK_POINTS else points, axis=0)
     # The pose-dependent deformation is neglected here.
     arms, _ = scout.arms(state, ())
 

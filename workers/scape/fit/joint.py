@@ -42,7 +42,7 @@ Array32 = NDArray[np.float32]
 
 _THUMB_STIFFNESS = 3.0
 """A thumb has few points, which must not turn it into the palm."""
-_LEAST_WEIGHT, _WEIGHT_SLACK = 1e-12, 1e-9
+_MIN_WEIGHT, _WEIGHT_SLACK = 1e-12, 1e-9
 """Added to the diagonal of each sample's weight, absolute and as a share of its trace, so that
 weights of rank 1 and 2 have a Cholesky factor."""
 
@@ -123,7 +123,7 @@ def _step(
     extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
     # The weights are split between both sides: numpy then computes one triangle of the product.
-    slack = _WEIGHT_SLACK * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + _LEAST_WEIGHT
+    slack = _WEIGHT_SLACK * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + _MIN_WEIGHT
     half = np.linalg.cholesky(terms.weight + slack * np.eye(3)).astype(np.float32)
     weighted = (half.transpose(0, 2, 1) @ derivative).reshape(-1, size)
     normal[:size, :size] = weighted.T @ weighted

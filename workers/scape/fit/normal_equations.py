@@ -37,7 +37,7 @@ _ASIDE = 2.0
 """Largest distance of a point to a vertex, as a multiple of its distance along the normal."""
 _SPACING_M = 0.002
 """Distance between neighbouring points."""
-_LEAST_FLOOR_TOLERANCE_M = 0.012
+_MIN_FLOOR_TOLERANCE_M = 0.012
 _FLOOR_TOLERANCE_SHARE = 0.5
 """Feet are placed on the floor if they are within this distance, or this share of the gate."""
 
@@ -136,7 +136,7 @@ def bound_rows(
     annealing: AnnealingStep,
 ) -> tuple[Rows, ...]:
     """Rows of the floor and, in the fine steps, of the outlines and the top of the head."""
-    tolerance_m = max(_LEAST_FLOOR_TOLERANCE_M, _FLOOR_TOLERANCE_SHARE * annealing.gate_m)
+    tolerance_m = max(_MIN_FLOOR_TOLERANCE_M, _FLOOR_TOLERANCE_SHARE * annealing.gate_m)
     floor = floor_rows(model, skin, tolerance_m)
     if annealing.coarse:
         return (floor,)

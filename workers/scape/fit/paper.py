@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 MAX_CORRESPONDENCE_DISTANCE_M = 0.05
 MAX_NORMAL_ANGLE_RAD = np.radians(15.0)
 SURFACE_WEIGHT = 1.0
-_MOST_ITERATIONS = 10
+_MAX_ITERATIONS = 10
 """Iterations of the whole loop; the paper uses ten."""
-_MOST_ALIGNMENTS = 20
+_MAX_ALIGNMENTS = 20
 """Repetitions of step (a)."""
 _SETTLED_M = 5e-4
 """Rms change of the mesh below which the loop ends."""
-_LEAST_PAIRS = 50
+_MIN_PAIRS = 50
 _SHAPE_RIDGE = 1e-3
 """Ridge of the shape's energy, as a share of its mean diagonal."""
 
@@ -50,7 +50,7 @@ def fit_like_the_paper(
     """The paper's loop; returns the surface, the last state and the number of iterations."""
     mesh = model.vertices(state)
     iteration = 0
-    for iteration in range(1, _MOST_ITERATIONS + 1):
+    for iteration in range(1, _MAX_ITERATIONS + 1):
         mesh, pairs = align_rigidly(model, target, mesh)
         on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
         observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
@@ -58,7 +58,7 @@ def fit_like_the_paper(
         solved = solve_mesh(model.vertices(state), pairs, target)
         change_m = float(np.sqrt(np.mean(np.sum((solved - mesh) ** 2, axis=1))))
         mesh = solved
-        progress(iteration / _MOST_ITERATIONS)
+        progress(iteration / _MAX_ITERATIONS)
         if change_m < _SETTLED_M:
             break
     seen = np.zeros(len(mesh), bool)
@@ -97,8 +97,8 @@ def find_pairs(model: BodyModel, target: Target, mesh: Array) -> Pairs:
 def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array, Pairs]:
     """Step (a), repeated: rigid motion of the mesh until its pairs no longer change."""
     pairs = find_pairs(model, target, mesh)
-    for _ in range(_MOST_ALIGNMENTS):
-        if len(pairs[0]) < _LEAST_PAIRS:
+    for _ in range(_MAX_ALIGNMENTS):
+        if len(pairs[0]) < _MIN_PAIRS:
             raise InputError(
                 "the paper's method finds no match with this cloud; use --method joint"
             )

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _CELL_M = 0.02
 """Points are thinned to one for each cube of this size; cubes that touch are connected."""
-_MOST_CELLS = 4_000_000
+_MAX_CELLS = 4_000_000
 """A cloud that fills a larger grid (20 x 2 x 2 m) is no body and has no patches."""
 FAR_M = 0.015
 """Distance from which a point is not explained: the folds of real people stay below it."""
@@ -30,7 +30,7 @@ ELSEWHERE_M = 0.15
 """Distance of a patch from which it is no limb of the person but something else."""
 _SHARE_OF_PATCH = 0.2
 """A patch is of every part that is nearest to at least so much of it."""
-_LEAST_WIDENED_M2 = 0.0005
+_MIN_WIDENED_M2 = 0.0005
 """Area from which a patch is more than a few stray readings: sound scans of the model's own family
 leave 2 cm^2 at most."""
 _WIDENED_RINGS = 3
@@ -54,7 +54,7 @@ def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> t
     """Patches of a cloud that a surface (P, 3) does not explain, the largest first."""
     cells = np.floor((cloud.points - cloud.points.min(axis=0)) / _CELL_M).astype(np.int64) + 1
     shape = tuple(int(n) for n in cells.max(axis=0) + 2)
-    if np.prod(shape, dtype=np.float64) > _MOST_CELLS:
+    if np.prod(shape, dtype=np.float64) > _MAX_CELLS:
         return ()
     cell, chosen = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_index=True)
     points = cloud.points[chosen]
@@ -86,7 +86,7 @@ def patch_sigma_m(model: BodyModel, patches: Sequence[Patch]) -> Array:
     as the patch, metres."""
     found = np.zeros(model.vertex_count)
     for patch in patches:
-        if patch.area_m2 < _LEAST_WIDENED_M2 or patch.distance_m > ELSEWHERE_M:
+        if patch.area_m2 < _MIN_WIDENED_M2 or patch.distance_m > ELSEWHERE_M:
             continue
         around = np.zeros(len(found))
         around[patch.vertices] = 1.0

@@ -16,13 +16,13 @@ from workers.scape.model.deformation import vertex_areas, vertex_normals
 
 Array = NDArray[np.float64]
 
-_LEAST_COVERAGE = 0.22
+_MIN_COVERAGE = 0.22
 """Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
 _HALF_COVERAGE = 0.6
 """Coverage below which a part cannot be measured when half the person is missing: of one half alone
 cameras see up to a half of it."""
 _LIMBS = ("left", "right")
-_LEAST_EXTREMITY_COVERAGE = 0.10
+_MIN_EXTREMITY_COVERAGE = 0.10
 """The same for hands, feet, shoulders and the neck, which hide behind other parts."""
 _LOST_PATCH_M2 = 0.0040
 """Least area of a patch of the scan farther than 15 mm from the surface that makes a scan unusable:
@@ -37,7 +37,7 @@ Well-placed cameras are moved by tenths of a millimetre, one that is 5 mm off it
 3 mm or more; the fit still corrects that."""
 _STATURES_M = (1.30, 2.25)
 """Statures of adults, metres."""
-_MOST_BETA = 6.0
+_MAX_BETA = 6.0
 """Largest shape coefficient of the first components, in standard deviations of people."""
 _JUDGED_COMPONENTS = 10
 _POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
@@ -180,11 +180,11 @@ def judge(
             f"the person is {stature_m:.2f} m tall; only adults of {low:.2f} to {high:.2f} m can "
             "be measured"
         )
-    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MOST_BETA:
+    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         reasons.append("what stands in the booth does not look like a person")
     halved = False
     for side, share in sides.items():
-        if share < _LEAST_COVERAGE:
+        if share < _MIN_COVERAGE:
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
             halved = True
     missing = [name for name in lost if name]
@@ -240,7 +240,7 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
 
 def _part_reasons(part: PartReport) -> list[str]:
     extremity = part.name.startswith(_EXTREMITIES)
-    if part.coverage < (_LEAST_EXTREMITY_COVERAGE if extremity else _LEAST_COVERAGE):
+    if part.coverage < (_MIN_EXTREMITY_COVERAGE if extremity else _MIN_COVERAGE):
         words = part_in_words(part.name)
         return [f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"]
     return []

@@ -57,16 +57,16 @@ _SIGMA_PER_MISMATCH = 2.5
 """Standard deviation of the offsets per rms distance of the points from the model's surface. More
 than 1, since folds and edges are steeper than a field of one range: errors on real people hardly
 change between 1.5 and 5."""
-_LEAST_SIGMA_M = 0.0008
+_MIN_SIGMA_M = 0.0008
 """Floor of the offsets' standard deviation: what the components leave out of the model's own
 bodies."""
 _INDEPENDENT = 0.2
 """Share of the points used that count as independent: the sensor's matching windows overlap."""
 _ON_SURFACE_M = 0.006
 """Largest distance of a point that lies on its triangle."""
-_LEAST_NOISE_M = 3e-4
+_MIN_NOISE_M = 3e-4
 """Floor of a reading's standard deviation: quantisation and calibration do not average out."""
-_MOST_POINTS = 25_000
+_MAX_POINTS = 25_000
 """Points used at most: twice as many change errors by less than 0.01 mm."""
 
 
@@ -102,14 +102,14 @@ class _Readings:
     @classmethod
     def build(cls, model: BodyModel, cloud: PointCloud, rims: PointCloud) -> _Readings:
         """An even subset of the cloud, and all rims."""
-        every = slice(None, None, -(-len(cloud.points) // _MOST_POINTS))
+        every = slice(None, None, -(-len(cloud.points) // _MAX_POINTS))
         points = np.concatenate([cloud.points[every], rims.points])
         directions = np.concatenate([cloud.normals[every], rims.normals])
         noise = np.concatenate([cloud.sigma_m[every], rims.sigma_m])
         return cls(
             points,
             directions,
-            _INDEPENDENT / np.maximum(noise, _LEAST_NOISE_M) ** 2,
+            _INDEPENDENT / np.maximum(noise, _MIN_NOISE_M) ** 2,
             len(points) - len(rims),
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
@@ -183,7 +183,7 @@ def fit_surface(
         away = readings.away_m(used, places.of(vertices, model.faces))
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
-        sigma_m = max(_SIGMA_PER_MISMATCH * before.rms_m, _LEAST_SIGMA_M)
+        sigma_m = max(_SIGMA_PER_MISMATCH * before.rms_m, _MIN_SIGMA_M)
         rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
         rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
         sigma_m /= np.sqrt(round_.stiffness)

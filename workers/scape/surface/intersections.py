@@ -25,7 +25,7 @@ from workers.scape.surface.crossings import crossing_pairs
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MOST_ROUNDS = 60
+_MAX_ROUNDS = 60
 _HOLDING_ROUNDS = 25
 """Rounds in which measured skin is held."""
 _YIELDING = 0.3
@@ -35,7 +35,7 @@ _OFFSET_ROUNDS = 3
 """Rounds in which offsets are smoothed; vertices that still cross after them are flattened."""
 _ROUNDS_PER_RING = 4
 """Rounds after which patches grow by one ring of vertices."""
-_MOST_TRIANGLES = 120
+_MAX_TRIANGLES = 120
 """Triangles of a connected patch that still cross after the first rounds: a larger patch is left
 alone, since flattening does not separate it."""
 _SWEEPS = 8
@@ -80,7 +80,7 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
     tested: Mask = np.ones(len(faces), bool)
     given_up: Mask = np.zeros(len(faces), bool)
     held = measured
-    for round_ in range(_MOST_ROUNDS):
+    for round_ in range(_MAX_ROUNDS):
         if round_ == _HOLDING_ROUNDS:
             held, trouble = np.zeros_like(measured), np.zeros_like(trouble)
         bad = _bad(current, reference, faces, tested) & ~given_up
@@ -125,7 +125,7 @@ def _in_large_patches(faces: Faces, bad: Mask, mean: sp.csr_matrix) -> Mask:
     of_vertex = np.full(len(corners), -1)
     of_vertex[around] = place
     of_face = of_vertex[faces[:, 0]]
-    large = np.bincount(of_face[bad], minlength=place.max(initial=0) + 1) > _MOST_TRIANGLES
+    large = np.bincount(of_face[bad], minlength=place.max(initial=0) + 1) > _MAX_TRIANGLES
     return np.asarray((of_face >= 0) & large[of_face])
 
 

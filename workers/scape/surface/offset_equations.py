@@ -25,7 +25,7 @@ from workers.scape.surface.offset_prior import OffsetPrior
 Array = NDArray[np.float64]
 Index = NDArray[np.integer]
 
-_MOST_STEPS = 400
+_MAX_STEPS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def solved(
     return np.asarray(
         _conjugate_gradients(
             precision.indptr, precision.indices, precision.data, 1.0 / sigma_m**2,
-            pattern.first, pattern.columns, blocks, right, start, tolerance, _MOST_STEPS,
+            pattern.first, pattern.columns, blocks, right, start, tolerance, _MAX_STEPS,
         )
     )  # fmt: skip
 

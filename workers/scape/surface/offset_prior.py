@@ -34,7 +34,7 @@ _KAPPA = np.sqrt(8.0) / RANGE_M
 _COTANGENTS = (0.05, 5.0)
 """Cotangents are clipped to this: obtuse triangles would couple vertices negatively, slivers
 infinitely."""
-_LEAST_AREA_M2 = 1e-8
+_MIN_AREA_M2 = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class OffsetPrior:
     @classmethod
     def build(cls, vertices: Array, faces: Faces) -> OffsetPrior:
         """Assemble the precision on a template's mean body (P, 3)."""
-        area = np.maximum(vertex_areas(vertices, faces), _LEAST_AREA_M2)
+        area = np.maximum(vertex_areas(vertices, faces), _MIN_AREA_M2)
         operator = (_KAPPA**2 * sp.diags(area) + _cotangent_laplacian(vertices, faces)).tocsr()
         precision = (operator @ sp.diags(1.0 / area) @ operator).tocsr()
         precision.sort_indices()
@@ -98,7 +98,7 @@ def _cotangent_laplacian(vertices: Array, faces: Faces) -> sp.csr_matrix:
             (vertices[stop] - vertices[faces[:, corner]]),
         )
         area = np.linalg.norm(np.cross(one, other), axis=1)
-        cotangent = np.einsum("ki,ki->k", one, other) / np.maximum(area, _LEAST_AREA_M2)
+        cotangent = np.einsum("ki,ki->k", one, other) / np.maximum(area, _MIN_AREA_M2)
         rows += [start, stop]
         columns += [stop, start]
         values += [0.5 * np.clip(cotangent, *_COTANGENTS)] * 2

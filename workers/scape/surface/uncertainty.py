@@ -28,7 +28,7 @@ _COMMON_SHARE = 0.2
 _FAMILY_MISMATCH_M = 0.0014
 """Mismatch of bodies of the model's own family (1.38 to 1.54 mm on validation bodies): noise of the
 readings and what the components leave out. People whom the model does not know show 2 to 3 mm."""
-_MOST_FURTHER_M = 0.0018
+_MAX_FURTHER_M = 0.0018
 """Largest further mismatch that counts, that of sculpted bodies (2.0 to 2.5 mm in all): the gains
 are learned on these, and real people, who show 2.8 to 3.2 mm, are not measured worse."""
 _LEFT_WHERE_SEEN = 0.35
@@ -56,7 +56,7 @@ def surface_sigma(model: BodyModel, seen: Mask, mismatch_m: Array, observed: Mas
     prior = offset_prior(model)
     away = np.minimum(prior.distance_m(seen), _FARTHEST_M)
     around = _amplitude_square(prior, mismatch_m, observed)
-    further = np.clip(around - _FAMILY_MISMATCH_M**2, 0.0, _MOST_FURTHER_M**2)
+    further = np.clip(around - _FAMILY_MISMATCH_M**2, 0.0, _MAX_FURTHER_M**2)
     further *= _unknown_share(away) + _LEFT_WHERE_SEEN**2
     usual = model.vertex_sigma_m**2 * _unknown_share(np.maximum(away - _USUAL_GAP_M, 0.0))
     drift = _DRIFT * np.maximum(away - RANGE_M, 0.0)

@@ -20,7 +20,7 @@ from workers.scape.learn.people.survey import (
 
 Array = NDArray[np.float64]
 
-MOST_MEAN_OFF = 0.3
+MAX_MEAN_OFF = 0.3
 """Difference of the means at equal stature, waist and age, in deviations of the survey."""
 SPREADS = (0.8, 1.3)
 """Standard deviation given stature, waist and age, against the survey's."""
@@ -47,7 +47,7 @@ class Likeness:
     @property
     def met(self) -> bool:
         low, high = SPREADS
-        return (not self.same_mean or abs(self.off) <= MOST_MEAN_OFF) and low <= self.spread <= high
+        return (not self.same_mean or abs(self.off) <= MAX_MEAN_OFF) and low <= self.spread <= high
 
 
 def likenesses(bodies: Persons, people: Persons) -> list[Likeness]:
@@ -110,7 +110,7 @@ def population_table(bodies: Persons) -> Iterator[str]:
         for row in likenesses(mine, people.take(people.female == female)):
             judged += 1
             met += row.met
-            limit = f"{MOST_MEAN_OFF:.1f}" if row.same_mean else "none"
+            limit = f"{MAX_MEAN_OFF:.1f}" if row.same_mean else "none"
             yield (
                 f" {sex:<6}{row.name:<28}{1e3 * row.mean_m:8.0f}{1e3 * row.off_m:7.1f}"
                 f"{row.off:7.2f}  ({limit:>4}){1e3 * row.spread_m:8.1f}{row.spread:8.2f}"

@@ -36,7 +36,7 @@ _SHIFT_SPREAD = 0.15
 that no person has."""
 _SCALE_SPREAD = 0.02
 _SHIFTS = ("-trans-", "buttocks-volume", "pelvis-tone", "neck-back", "neck-double")
-_MOST_LOCAL = 1.0
+_MAX_LOCAL = 1.0
 _SCALES = (0.9, 1.1)
 _STEP = 0.3
 """Step of the finite differences, in spreads."""
@@ -44,7 +44,7 @@ _ROUNDS = 9
 _UNMEASURED = 100.0
 _TOLERANCE = 0.15
 """Tolerance of a size, in standard deviations of people alike in stature, waist and age."""
-_MOST_CHANGE = 1.0
+_MAX_CHANGE = 1.0
 """Spreads by which a round changes a parameter at most."""
 _FATS = (-1.0, 0.8, 2.6)
 """Fat of the lean, the middle and the heavy reference body, in standard deviations."""
@@ -135,7 +135,7 @@ class _Parameters:
 
 def _within(value: Array, change: Array) -> Array:
     """A change ends at the limits, but never turns round what lies beyond them already."""
-    limit = np.maximum(_MOST_LOCAL, np.abs(value))
+    limit = np.maximum(_MAX_LOCAL, np.abs(value))
     return np.clip(value + change, -limit, limit)
 
 
@@ -193,7 +193,7 @@ class Tailor:
         tolerance = self._tolerance[persons.female.astype(np.intp)]
         jacobian = self._jacobian(persons) / tolerance[:, :, None]
         left = self._left(shapes, persons, tolerance)
-        trust = np.full(len(shapes), _MOST_CHANGE)
+        trust = np.full(len(shapes), _MAX_CHANGE)
         every = np.ones(jacobian.shape[::2], bool)
         for _ in range(_ROUNDS):
             room = self._parameters.room(shapes, self._smallest(jacobian, left, every))
@@ -207,7 +207,7 @@ class Tailor:
             size = np.square(change).sum(axis=1) + 1e-9
             jacobian += unforeseen[:, :, None] * (change / size[:, None])[:, None, :]
             better = np.square(found).sum(axis=1) < np.square(left).sum(axis=1)
-            trust = np.where(better, np.minimum(1.5 * trust, _MOST_CHANGE), 0.4 * trust)
+            trust = np.where(better, np.minimum(1.5 * trust, _MAX_CHANGE), 0.4 * trust)
             shapes = shapes.replaced(better, tried)
             left = np.where(better[:, None], found, left)
         return shapes, np.sqrt(np.square(left).mean(axis=1))
