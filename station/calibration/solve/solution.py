@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from station.calibration.adjust.averaging import averaged, likeliest
 from station.calibration.adjust.joint import solve_joint
@@ -134,6 +135,23 @@ def solve(
     Raises:
         CalibrationError: naming the camera or the step that spoils it, and what to do.
     """
+    # The other core is used by whatever runs beside it, and more threads only wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _solve(
+            observations, cameras, radius_m, reference, front_cameras, created, progress, limits
+        )
+
+
+def _solve(
+    observations: Observations,
+    cameras: Mapping[str, CameraCalibration],
+    radius_m: float,
+    reference: str,
+    front_cameras: Sequence[str],
+    created: str,
+    progress: Progress,
+    limits: Limits,
+) -> Solution:
     progress("checking what was seen")
     covered = Coverage(cameras, reference)
     for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
