@@ -12,7 +12,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
@@ -40,6 +40,18 @@ class ScanIndex:
     def __init__(self, spool: Spool) -> None:
         self._spool = spool
         self._path = spool.folder / FILE
+        self._held: sqlite3.Connection | None = None
+
+    def hold(self) -> None:
+        """Keep the database open until `release`; the last one to close it writes it to disk."""
+        with suppress(sqlite3.Error):
+            self._held = self._connect(shared=True)
+
+    def release(self) -> None:
+        """Undo `hold`, from any thread."""
+        if self._held is not None:
+            self._held.close()
+            self._held = None
 
     def find(
         self,
@@ -109,14 +121,18 @@ class ScanIndex:
         with closing(database):
             yield database
 
-    def _connect(self) -> sqlite3.Connection:
+    def _connect(self, *, shared: bool = False) -> sqlite3.Connection:
         mask = os.umask(0o177)
         try:
-            database = sqlite3.connect(self._path, timeout=_BUSY_S, isolation_level=None)
+            database = sqlite3.connect(
+                self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=not shared
+            )
         finally:
             os.umask(mask)
         try:
             database.execute("PRAGMA journal_mode = WAL")
+            # The folders are what lasts: nobody waits for the disk for the sake of this cache.
+            database.execute("PRAGMA synchronous = NORMAL")
             # Labels of purged scans must not stay behind in the file's free pages.
             database.execute("PRAGMA secure_delete = ON")
             found = database.execute("PRAGMA user_version").fetchone()[0]
