@@ -26,7 +26,7 @@ from console_page import (
     wait_for_value,
 )
 from live_console import API, LiveConsole
-from playwright.sync_api import BrowserContext, Page, expect
+from playwright.sync_api import BrowserContext, Page, Route, expect
 
 AXE = Path(__file__).parent / "node_modules/axe-core/axe.min.js"
 _NOTE_REMEDY = """() => {
@@ -228,6 +228,35 @@ def test_a_calibration_step_from_recordings(page: Page, console: LiveConsole) ->
     expect(page.locator("#task-error")).to_be_visible(timeout=LONG_MS)
 
 
+def test_the_height_of_a_stand_is_asked_for(page: Page, console: LiveConsole) -> None:
+    with console.client() as client:
+        task = client.get("/task").json()
+    asks = {"kind": "calibrate", "running": True, "waits_for": "height", "error": "", "lines": []}
+    question = (
+        "A ball on a stand of measured height on the mark makes heights more certain. "
+        "How high is its underside above the floor?"
+    )
+    told: list[Any] = []
+
+    def answered(route: Route) -> None:
+        told.append(route.request.post_data_json)
+        route.fulfill(json=task)
+
+    asking = {**task, **asks, "title": "Ball", "question": question}
+    page.route("**/api/v1/task", lambda route: route.fulfill(json=asking))
+    page.route("**/api/v1/task/answer", answered)
+    open_view(page, console, "calibration")
+    page.fill("#height", "500")
+    page.press("#height", "Enter")
+    assert told == []
+    page.fill("#height", "170.2")
+    _picture(page, "calibration-stand")
+    _accessible(page)
+    page.press("#height", "Enter")
+    expect(page.locator("#calibrate")).to_be_visible()
+    assert told == [{"answer": "yes", "height_m": 1.702}]
+
+
 def test_a_killed_camera_is_told_with_its_remedy(page: Page, console: LiveConsole) -> None:
     open_view(page, console, "booth")
     card = page.locator("[data-camera=back-upper]")
@@ -279,6 +308,7 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     assert page.evaluate("document.documentElement.lang") == "zh-CN"
     open_view(page, console, f"result/{scans[0]['scan_id']}")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
+    expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
     _picture(page, "result-zh")
     page.select_option("#language", "en")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("Waist", timeout=20_000)

@@ -170,8 +170,9 @@ def stop_task(console: Booth, caller: Manager) -> Task:  # noqa: ARG001
 
 @router.post("/task/answer", responses=responses(409), tags=["calibration"])
 def answer(body: Answer, console: Booth, caller: Manager) -> Task:  # noqa: ARG001
-    """Answer "go", "yes" or "no" to the waiting task."""
-    return Task(**console.tasks.answer(body.answer))
+    """Answer "go", "yes" or "no" to the waiting task; a height is answered "yes" and `height_m`."""
+    height = body.answer == "yes" and body.height_m is not None
+    return Task(**console.tasks.answer(str(body.height_m) if height else body.answer))
 
 
 @router.post("/calibration", status_code=202, responses=responses(409), tags=["calibration"])

@@ -233,7 +233,9 @@ class CameraShift(BaseModel):
 class NewStep(_Strict):
     """A step of the calibration."""
 
-    step: Literal["all", "floor", "ball", "mark", "front", "around", "depth", "solve"] = "all"
+    step: Literal["all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve"] = (
+        "all"
+    )
     new: bool = Field(default=False, description="start over; recorded data are set aside")
 
 
@@ -241,6 +243,9 @@ class Answer(_Strict):
     """The operator's answer to a running step."""
 
     answer: Literal["go", "yes", "no"]
+    height_m: float | None = Field(
+        default=None, ge=0.3, le=2.2, description="with yes: the height that is asked for, metres"
+    )
 
 
 class Task(BaseModel):

@@ -17,7 +17,7 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.config import load_config
 from station.core.errors import BoothError
 
-STEPS = ("all", "floor", "ball", "mark", "front", "around", "depth", "solve")
+STEPS = ("all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve")
 _PROGRESS_S = 0.2
 
 
@@ -68,8 +68,15 @@ class PageGuide(Guide):
         return self._answer() == "yes"
 
     def height_m(self) -> float | None:
-        """None: the page asks for no numbers; `station calibrate stand` adds a stand."""
-        return None
+        if not self.attended:
+            return None
+        self._say(
+            "height",
+            text="A ball on a stand of measured height on the mark makes heights more certain. "
+            "How high is its underside above the floor?",
+        )
+        answer = self._answer()
+        return None if answer == "no" else float(answer)
 
     def end_line(self) -> None:
         """Do nothing: the page has no line that is overwritten."""
@@ -100,6 +107,8 @@ def run(config_path: Path, step: str, new: bool) -> None:
                 procedure.rest(MARK if step == "mark" else FRONT)
             case "around":
                 procedure.around(asked=False)
+            case "stand":
+                procedure.stands()
             case "depth":
                 procedure.walls(asked=False)
             case "solve":

@@ -20,6 +20,8 @@ from station.core.service import die_with_parent
 
 _LINES_KEPT = 60
 _EXIT_MOVED = 3
+_ANSWERS = {"go": ("go",), "yes or no": ("yes", "no"), "height": ("no",)}
+"""Kind of question -> the words that answer it; a height is answered by a number, too."""
 CHECK_FILE = "last-check.json"
 
 
@@ -67,15 +69,18 @@ class Tasks:
         )
 
     def answer(self, word: str) -> dict[str, Any]:
-        """Pass on the operator's answer to the running task: "go", "yes" or "no".
+        """Pass on the operator's answer to the running task: "go", "yes", "no", or metres.
 
         Raises:
-            RefusedError: it is not waiting for an answer.
+            RefusedError: it is not waiting for this answer.
         """
         with self._lock:
-            process = self._process
-            if process is None or process.stdin is None or not self._state["waits_for"]:
+            process, asked = self._process, self._state["waits_for"]
+            if process is None or process.stdin is None or not asked:
                 raise RefusedError("nothing is waiting for an answer")
+            known = ("go", "yes", "no")
+            if word not in _ANSWERS[asked] and (asked != "height" or word in known):
+                raise RefusedError(f"this is no answer to the question; it asks for: {asked}")
             self._state["waits_for"] = ""
             process.stdin.write(f"{word}\n")
             process.stdin.flush()
@@ -147,6 +152,8 @@ class Tasks:
                     state["progress"] = text
                 case "question":
                     state |= {"question": text, "waits_for": "yes or no"}
+                case "height":
+                    state |= {"question": text, "waits_for": "height"}
                 case "line" | "done":
                     state["lines"] = [*state["lines"], text][-_LINES_KEPT:]
                 case "error":

@@ -16,6 +16,7 @@ from station.archive.index import ScanIndex
 from station.archive.records import PLACES, ScanRecord
 from station.console.live.control import NotRunningError, RefusedError, command
 from station.console.live.events import EventLog
+from station.console.live.folders import FolderChanges
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
 from station.core.spool import Spool
@@ -23,7 +24,8 @@ from station.messaging.messages import CameraHealth, Request, ScanEvent
 from station.messaging.transport import endpoint, subscriber
 
 _POLL_MS = 50
-_SPOOL_S = 0.1
+_LOOK_S = 0.1
+"""Period of looking at the spool where the kernel tells nothing, and for silent cameras."""
 _STATUS_S = 1.0
 _SILENT_S = 1.3
 """Health is sent twice a second; two missing reports mean that the capture process is gone."""
@@ -71,6 +73,7 @@ class Watch:
         ]
 
     def start(self) -> None:
+        self._index.hold()
         for thread in self._threads:
             thread.start()
 
@@ -78,6 +81,7 @@ class Watch:
         self._stop.set()
         for thread in self._threads:
             thread.join(5.0)
+        self._index.release()
 
     def hangs(self) -> bool:
         """Whether the watching thread has stopped making progress."""
@@ -110,6 +114,9 @@ class Watch:
         poller = zmq.Poller()
         poller.register(incoming, zmq.POLLIN)
         poller.register(ends, zmq.POLLIN)
+        changes = FolderChanges(self._config.spool.folder / place for place in PLACES)
+        if changes.fileno() >= 0:
+            poller.register(changes.fileno(), zmq.POLLIN)
         looked_s = 0.0
         while not self._stop.is_set():
             self._round_s = time.monotonic()
@@ -118,17 +125,22 @@ class Watch:
                 if incoming in ready:
                     self._receive(*incoming.recv_multipart())
                 if ends in ready:
+                    # Its last reports are older than its end.
+                    while incoming.poll(0):
+                        self._receive(*incoming.recv_multipart())
                     self._hear_end(recv_monitor_message(ends)["endpoint"].decode())
                 now_s = time.monotonic()
-                if now_s - looked_s > _SPOOL_S:
+                moved = changes.fileno() in ready and changes.any()
+                if moved or now_s - looked_s > _LOOK_S:
                     looked_s = now_s
-                    self._watch_spool()
+                    self._watch_spool(moved)
                     self._watch_silence(now_s)
                     self._problem = ""
             except (BoothError, OSError, zmq.ZMQError) as error:
                 self._log.warning("watching the booth: %s", error)
                 self._problem = f"the booth cannot be watched ({error}); retrying"
                 self._stop.wait(1.0)
+        changes.close()
         incoming.disable_monitor()
         context.destroy(linger=0)
 
@@ -160,10 +172,12 @@ class Watch:
 
     def _watch_silence(self, now_s: float) -> None:
         for camera in self._cameras.values():
-            if camera.state != "dead" and now_s - camera.heard_s > _SILENT_S:
+            if now_s - camera.heard_s > _SILENT_S:
                 self._set_dead(camera)
 
     def _set_dead(self, camera: CameraState) -> None:
+        if camera.state == "dead":
+            return  # told already: it hung, and was killed for it
         camera.state = "dead"
         camera.detail = (
             "its capture process is not responding and is restarted automatically; if "
@@ -171,12 +185,13 @@ class Watch:
         )
         self._events.append("camera", camera.document())
 
-    def _watch_spool(self) -> None:
+    def _watch_spool(self, moved: bool) -> None:
         folder = self._config.spool.folder
         changed = tuple(
             (folder / place).stat().st_mtime_ns for place in PLACES if (folder / place).is_dir()
         )
-        if changed == self._spool_ns and time.time_ns() - max(changed, default=0) > 1_000_000_000:
+        settled = changed == self._spool_ns and not moved
+        if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
         found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}

@@ -5,8 +5,11 @@ import { Cameras } from './cameras.js';
 import { ask, h, notice } from './dom.js';
 import { listen } from './events.js';
 import { said, t, time } from './i18n.js';
+import { settings } from './settings.js';
 
-const STEPS = ['floor', 'ball', 'mark', 'around', 'depth', 'solve'];
+const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
+const LOWEST_M = 0.3;
+const HIGHEST_M = 2.2;
 
 export async function calibration(main, session) {
   const booth = await get('/booth');
@@ -17,7 +20,7 @@ export async function calibration(main, session) {
   const begin = async (step, fresh = false) => {
     try { show(await post('/calibration', { step, new: fresh }, { 'Idempotency-Key': freshKey() })); } catch (error) { notice(error.message, true); }
   };
-  const say = async (word) => { try { show(await post('/task/answer', { answer: word })); } catch (error) { notice(error.message, true); } };
+  const say = async (word, more = {}) => { try { show(await post('/task/answer', { answer: word, ...more })); } catch (error) { notice(error.message, true); } };
   const halt = async () => { try { show(await remove('/task')); } catch (error) { notice(error.message, true); } };
   const buttons = [];
   const button = (step) => { const one = h('button', { 'data-step': step, onclick: () => begin(step), 'aria-label': `${t('cal.do')}: ${t(`cal.${step}`)}` }, t('cal.do')); buttons.push(one); return one; };
@@ -34,6 +37,20 @@ export async function calibration(main, session) {
       tell ? h('div', { className: 'log', id: 'log' }, task.lines.map((line) => h('div', {}, said(line)))) : '');
   }
 
+  const asks = (task) => task.waits_for === 'yes or no' || task.waits_for === 'height';
+
+  // The stand is measured to a millimetre.
+  function height() {
+    const metres = settings.unit === 'in' ? 0.0254 : 0.01;
+    const input = h('input', { type: 'number', id: 'height', inputMode: 'decimal', required: true,
+      step: 'any', min: Math.ceil(LOWEST_M / metres), max: Math.floor(HIGHEST_M / metres) });
+    return h('form', { onsubmit: (event) => {
+      event.preventDefault();
+      say('yes', { height_m: Math.round(1000 * metres * input.valueAsNumber) / 1000 });
+    } }, h('label', { htmlFor: 'height' }, t('cal.height', { unit: t(`unit.${settings.unit}`) })), input,
+    h('button', { className: 'primary' }, t('cal.go')));
+  }
+
   function running(task) {
     const percent = /(\d+) % covered/.exec(task.progress);
     const of = /(\d+) of (\d+)/.exec(task.progress);
@@ -41,12 +58,14 @@ export async function calibration(main, session) {
     const bar = h('progress', { max: 1, 'aria-label': said(task.progress) || t('loading') });
     if (share !== null) bar.value = share;
     now.className = 'card now';
-    now.replaceChildren(h('h2', {}, task.title ? said(task.title) : t('loading')), h('p', { className: 'instruction' }, said(task.waits_for === 'yes or no' ? task.question : task.instruction)),
+    now.replaceChildren(h('h2', {}, task.title ? said(task.title) : t('loading')), h('p', { className: 'instruction' }, said(asks(task) ? task.question : task.instruction)),
       task.countdown_s ? h('div', { className: 'count' }, String(task.countdown_s)) : '',
+      task.waits_for === 'height' ? height() : '',
       h('div', { className: 'actions left' },
         task.waits_for === 'go' ? h('button', { className: 'primary', onclick: () => say('go') }, t('cal.go')) : '',
         task.waits_for === 'yes or no' ? h('button', { className: 'primary', onclick: () => say('yes') }, t('cal.yes')) : '',
         task.waits_for === 'yes or no' ? h('button', { onclick: () => say('no') }, t('cal.no')) : '',
+        task.waits_for === 'height' ? h('button', { id: 'no-stand', onclick: () => say('no') }, t('cal.noStand')) : '',
         h('button', { className: 'danger', id: 'halt', onclick: halt }, t('cal.stop'))),
       task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, said(task.progress) || ' '), bar),
       h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, said(line)))));

@@ -1,0 +1,101 @@
+"""Folders and cameras as the console watches them, and the answers it passes on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from station.console.live.control import RefusedError
+from station.console.live.events import EventLog
+from station.console.live.folders import FolderChanges
+from station.console.live.tasks import Tasks
+from station.console.live.watch import Watch
+from station.core.config import load_config
+from station.messaging.messages import CameraHealth
+from station.messaging.transport import publisher
+
+
+def _until(true: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def watch(tmp_path: Path) -> Iterator[tuple[Watch, EventLog]]:
+    (tmp_path / "booth.toml").write_text(
+        '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+    )
+    config = load_config(tmp_path / "booth.toml")
+    events = EventLog()
+    watching = Watch(config, events, logging.getLogger())
+    watching.start()
+    yield watching, events
+    watching.close()
+
+
+def _states(events: EventLog) -> list[str]:
+    return [json.loads(e.data)["state"] for e in events.after(0) if e.kind == "camera"]
+
+
+def test_changes_of_folders_are_told(tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir()
+    (tmp_path / "away").mkdir()
+    changes = FolderChanges([tmp_path / "here", tmp_path / "missing"])
+    assert not changes.any()
+    (tmp_path / "away/result").mkdir()
+    assert not changes.any()
+    (tmp_path / "away/result").rename(tmp_path / "here/result")
+    assert changes.any()
+    assert not changes.any()
+    (tmp_path / "here/result").rmdir()
+    assert changes.any()
+    changes.close()
+
+
+def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> None:
+    """It hangs, is given up as silent, and its socket closes when it is killed for it."""
+    watching, events = watch
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    socket = publisher(context, watching._config.runtime.folder, "camera-a", "health")
+    health = CameraHealth("a", "streaming", "", 1, 0, 0)
+
+    def reports() -> bool:
+        socket.send_multipart([b"health", health.pack()])
+        return "streaming" in _states(events)
+
+    _until(reports)
+    _until(lambda: _states(events)[-1] == "dead")
+    context.destroy(linger=0)
+    time.sleep(2.0)
+    assert _states(events) == ["streaming", "dead"]
+
+
+_ASKS = """
+import json, sys
+print(json.dumps({"kind": "height", "text": "how high?"}), flush=True)
+print(json.dumps({"kind": "done", "text": sys.stdin.readline().strip()}), flush=True)
+"""
+
+
+def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
+    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    with pytest.raises(RefusedError, match="nothing is waiting"):
+        tasks.answer("1.7")
+    tasks._begin("calibrate", "stand", [sys.executable, "-c", _ASKS])
+    _until(lambda: bool(tasks.state()["waits_for"]))
+    assert tasks.state()["question"] == "how high?"
+    for word in ("go", "yes"):
+        with pytest.raises(RefusedError, match="no answer"):
+            tasks.answer(word)
+    tasks.answer("1.7")
+    _until(lambda: not tasks.state()["running"])
+    assert tasks.state()["lines"] == ["1.7"]
