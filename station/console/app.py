@@ -10,16 +10,15 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import FileResponse
+from starlette.requests import Request
 from starlette.responses import Response
-from starlette.staticfiles import StaticFiles
-from starlette.types import Scope
 
 from station import __version__
 from station.archive.phrases import PHRASES
 from station.console.api import booth, live, results, scans
 from station.console.api.console import Console
 from station.console.api.problems import Problem, install
+from station.console.assets import Asset, Assets
 from station.console.security.gate import Gate
 from station.console.security.origin import own_names
 
@@ -27,15 +26,6 @@ PREFIX = "/api/v1"
 STATIC = Path(__file__).parent / "static"
 _REPORT_PERIOD_S = 0.2
 """Shorter than the period of health reports, so that none is left out."""
-
-
-class _Static(StaticFiles):
-    """Files of the page: a browser caches them and revalidates them each time."""
-
-    async def get_response(self, path: str, scope: Scope) -> Response:
-        response = await super().get_response(path, scope)
-        response.headers["cache-control"] = "no-cache"
-        return response
 
 
 def create_app(console: Console) -> FastAPI:
@@ -80,23 +70,21 @@ async def _report_progress(console: Console) -> None:
 
 
 def _serve_pages(app: FastAPI) -> None:
-    for path, name in (
-        ("/", "index.html"),
-        ("/person", "person.html"),
-        (f"{PREFIX}/docs", "docs.html"),
+    assets = Assets(STATIC)
+    for path, asset in (
+        ("/", assets["index.html"]),
+        ("/person", assets["person.html"]),
+        (f"{PREFIX}/docs", assets["docs.html"]),
+        # The page's words for what the station says are those of the printed sheet.
+        ("/static/phrases.json", Asset.read(PHRASES)),
     ):
-        file = _file(STATIC / name)
-        app.add_api_route(path, file, include_in_schema=False, response_class=FileResponse)
-    # The page's words for what the station says are those of the printed sheet.
-    app.add_api_route(
-        "/static/phrases.json", _file(PHRASES), include_in_schema=False, response_class=FileResponse
-    )
-    app.mount("/static", _Static(directory=STATIC), name="static")
+        app.add_route(path, _sender(asset))
+    app.mount("/static", assets, name="static")
 
 
-def _file(path: Path) -> Any:
-    def file() -> FileResponse:
-        return FileResponse(path, headers={"cache-control": "no-cache"})
+def _sender(asset: Asset) -> Any:
+    async def file(request: Request) -> Response:
+        return asset.answer(request.headers)
 
     return file
 

@@ -75,6 +75,24 @@ def test_files_have_ranges_and_tags(console: LiveConsole, scans: list[dict[str, 
         assert (same.status_code, same.content) == (304, b"")
 
 
+def test_the_pages_files_are_packed_and_tagged(console: LiveConsole) -> None:
+    with httpx.Client(base_url=console.url) as client:
+        plain = client.get("/static/js/app.js", headers={"Accept-Encoding": "identity"})
+        assert "content-encoding" not in plain.headers
+        packed = client.get("/static/js/app.js")
+        assert packed.headers["content-encoding"] == "gzip"
+        assert packed.content == plain.content
+        assert packed.headers["content-type"].startswith("text/javascript")
+        tag = packed.headers["etag"]
+        same = client.get("/static/js/app.js", headers={"If-None-Match": tag})
+        assert (same.status_code, same.content) == (304, b"")
+        assert "content-security-policy" in client.get("/").headers
+        assert client.head("/static/icon.svg").status_code == 200
+        assert client.post("/static/icon.svg").status_code == 405
+        for path in ("/static/", "/static/js", "/static/../app.py", "/static/%2e%2e/app.py"):
+            assert client.get(path).status_code == 404, path
+
+
 def test_the_same_key_never_scans_twice(console: LiveConsole, scans: list[dict[str, Any]]) -> None:
     with console.client("scan") as client:
         first = client.post(

@@ -45,9 +45,13 @@ async function logOut() {
   location.reload();
 }
 
-async function show() {
+function wanted() {
   const [, name = 'scan', ...rest] = location.hash.split('/');
-  const view = VIEWS[name] ? name : 'scan';
+  return [VIEWS[name] ? name : 'scan', rest];
+}
+
+async function show() {
+  const [view, rest] = wanted();
   const mine = ++turn;
   leave();
   leave = () => {};
@@ -102,6 +106,7 @@ listen((kind) => {
 window.addEventListener('hashchange', show);
 window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
+VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for
 const found = await get('/session');
 await loadWords(found.language);
 document.getElementById('skip').textContent = t('app.skip');

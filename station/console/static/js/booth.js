@@ -8,6 +8,12 @@ import { said, t, time } from './i18n.js';
 
 const REFRESH_MS = 5000;
 
+// A stored calibration is named by its date, without the marks between the numbers.
+function calibrated(name) {
+  if (!name) return t('booth.none');
+  return time(name.replace(/^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)Z$/, '$1-$2-$3T$4:$5:$6Z'));
+}
+
 export async function booth(main) {
   let state = await get('/booth');
   const cameras = new Cameras(state.cameras.map((camera) => camera.name));
@@ -48,7 +54,7 @@ export async function booth(main) {
       [t('booth.queue'), String(state.spool.queue + state.spool.work)],
       [t('booth.failed'), String(state.spool.failed)],
       [t('booth.disk'), `${(state.disk_free_mb / 1000).toFixed(1)} GB`],
-      [t('booth.calibration'), state.calibration || t('booth.none')],
+      [t('booth.calibration'), calibrated(state.calibration)],
     ];
     facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name), h('dd', {}, value)]));
     const fault = !state.running ? t('booth.notRunning', { fault: said(state.fault) })

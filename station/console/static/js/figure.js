@@ -21,10 +21,13 @@ const LEFT = {
   foot: 'M87 318h13l8 14H86z',
 };
 
-export function bodyFigure(doubtful = []) {
+// Without a list, the parts in question are not known (yet).
+export function bodyFigure(parts = null) {
+  const doubtful = parts ?? [];
   const names = doubtful.map((name) => t(`part.${name}`)).join(', ');
   const label = names ? t('scan.figure', { parts: names }) : t('scan.figureGood');
-  const figure = s('svg', { viewBox: '0 0 160 340', class: 'body-figure', role: 'img', 'aria-label': label });
+  const told = parts ? { role: 'img', 'aria-label': label } : { 'aria-hidden': 'true' };
+  const figure = s('svg', { viewBox: '0 0 160 340', class: 'body-figure', ...told });
   const part = (name, d, mirrored) => {
     const marked = doubtful.includes(name);
     const transform = mirrored ? 'translate(160 0) scale(-1 1)' : null;

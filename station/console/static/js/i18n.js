@@ -3,9 +3,11 @@
 let words = {};
 let phrases = [];
 let language = 'en';
+// Asked for at once, while the page's other parts are still on their way.
+const coming = fetch('/static/catalogue.json').then((answer) => answer.json());
 
 export async function loadWords(fallback) {
-  const catalogue = await (await fetch('/static/catalogue.json')).json();
+  const catalogue = await coming;
   const kept = stored('language');
   language = catalogue[kept] ? kept : (fallback || 'en');
   words = catalogue[language];
@@ -47,9 +49,10 @@ export function currentLanguage() { return language; }
 export function setLanguage(value) { store('language', value); }
 
 export function time(iso) {
-  if (!iso) return '';
+  const moment = new Date(iso);
+  if (!iso || Number.isNaN(moment.valueOf())) return iso || '';
   const locale = language === 'zh' ? 'zh-CN' : 'en-GB';
-  return new Intl.DateTimeFormat(locale, { dateStyle: 'medium', timeStyle: 'short' }).format(new Date(iso));
+  return new Intl.DateTimeFormat(locale, { dateStyle: 'medium', timeStyle: 'short' }).format(moment);
 }
 
 export function stored(name) {

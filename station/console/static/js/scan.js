@@ -129,25 +129,27 @@ export async function scan(main, session) {
     ask();
   }
 
-  async function finish() {
+  // Marks the parts that the verdict doubts when they are known.
+  async function mark(done, figure) {
+    try {
+      const quality = await get(`/scans/${done.scan_id}/quality`);
+      const doubtful = quality.parts.filter((part) => part.doubtful).map((part) => part.name);
+      figure.replaceWith(bodyFigure(doubtful));
+    } catch { /* the verdict stands without it */ }
+  }
+
+  function finish() {
     clearInterval(timer);
     const done = current;
     const seconds = ((performance.now() - pressed) / 1000).toFixed(1);
-    let doubtful = [];
-    if (done.state !== 'failed') {
-      try {
-        const quality = await get(`/scans/${done.scan_id}/quality`);
-        doubtful = quality.parts.filter((part) => part.doubtful).map((part) => part.name);
-      } catch { /* the verdict stands without it */ }
-    }
-    if (current !== done) return;
+    const figure = bodyFigure();
     const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
     const again = h('button', { id: 'again', className: look === 'ok' ? '' : 'primary', onclick: begin }, t('scan.again'));
     again.addEventListener('click', () => { again.disabled = true; });
     stage.replaceChildren(
       done.state === 'failed' ? '' : h('p', { className: 'leave', id: 'leave' }, t('scan.leave')),
       h('div', { className: `verdict ${look}`, id: 'verdict', 'data-verdict': look },
-        bodyFigure(doubtful),
+        figure,
         h('div', {}, h('h2', {}, t(`scan.${look}`)), h('p', {}, done.label || t('result.noLabel')),
           done.reasons.length ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
           done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: seconds })))),
@@ -156,6 +158,7 @@ export async function scan(main, session) {
         again,
         h('button', { id: 'next', onclick: () => { label = ''; ready(); document.getElementById('label').focus(); } }, t('scan.next'))),
       h('button', { id: 'go', hidden: true }));
+    if (done.state !== 'failed') mark(done, figure);
     latest();
   }
 
