@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from station.messaging.intake import LiveFrame
 
 _STRIDE_PX = 6
 _LOOK_PERIOD_S = 2.0
-"""Period of looking for a missing calibration."""
+"""Period of looking for a new calibration."""
 
 
 def merged_points(
@@ -36,11 +35,12 @@ def merged_points(
 
 
 class LiveCloud:
-    """Converts a frameset to a cloud now and then, once there is a calibration."""
+    """Converts a frameset to a cloud now and then, with the calibration in use if there is one."""
 
     def __init__(self, calibration: Path, rate_hz: float) -> None:
         self._calibration, self._period_s = calibration, 1.0 / rate_hz
         self._last_s = self._looked_s = -1e9
+        self._file = (0, 0)
         self.rig: Rig | None = None
 
     def points(self, found: Frameset[LiveFrame], now_s: float) -> NDArray[np.float32] | None:
@@ -48,10 +48,9 @@ class LiveCloud:
         if now_s - self._last_s < self._period_s:
             return None
         self._last_s = now_s
-        if self.rig is None and now_s - self._looked_s > _LOOK_PERIOD_S:
+        if now_s - self._looked_s > _LOOK_PERIOD_S:
             self._looked_s = now_s
-            with suppress(BoothError, OSError):
-                self.rig = Rig.load(self._calibration)
+            self._look()
         rig = self.rig
         if rig is None:
             return None
@@ -63,3 +62,14 @@ class LiveCloud:
         }
         scale_m = next(iter(found.frames.values())).header.depth_scale_m
         return merged_points(rig, fitting, scale_m)
+
+    def _look(self) -> None:
+        """Load the calibration if its file is another one than before."""
+        try:
+            status = self._calibration.stat()
+            file = status.st_ino, status.st_mtime_ns
+            if file != self._file:
+                self.rig = Rig.load(self._calibration)
+                self._file = file
+        except (BoothError, OSError):
+            return
