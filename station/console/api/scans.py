@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import secrets
+import time
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 
-from station.archive.records import ScanRecord, ScanState, moment_of
+from station.archive.records import ScanRecord, ScanState
 from station.booth.retention import purge_scan
 from station.console.api.console import (
     Booth,
@@ -24,6 +26,7 @@ from station.console.api.console import (
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, RefusedError, command
+from station.core.scans import boot_id
 from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
@@ -69,14 +72,16 @@ def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = N
     """Take a scan. With an Idempotency-Key the same request never scans twice."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     fresh = f"{stamp}-{secrets.token_hex(2)}"
-    scan_id = once(console, caller, key, body.model_dump_json(), fresh)
+    mark = f"{fresh} {boot_id()} {time.monotonic():.3f}"
+    first = once(console, caller, key, body.model_dump_json(), mark)
+    scan_id = first.partition(" ")[0]
     if scan_id != fresh:
         # Repeated request: a finished scan is not taken again even if the station has forgotten it.
         try:
             return _state(console, scan_id)
         except ProblemError:
             # Not taken up yet: the same id is one scan, however often the station is told.
-            if _age_s(scan_id) > _TAKEN_UP_S:
+            if _age_s(first) > _TAKEN_UP_S:
                 # Deleted since: it is not begun again.
                 raise
     console.audit.note(caller.name, caller.address, "scan", scan_id)
@@ -95,10 +100,11 @@ def state(scan_id: ScanId, console: Booth, caller: Reader) -> Scan:  # noqa: ARG
     return _state(console, scan_id)
 
 
-def _age_s(scan_id: str) -> float:
-    """Seconds since a scan id was made."""
-    made = datetime.fromisoformat(moment_of(scan_id))
-    return (datetime.now(UTC) - made).total_seconds()
+def _age_s(mark: str) -> float:
+    """Seconds since a scan was first asked for; infinite if that was before this boot."""
+    _, _, made = mark.partition(" ")
+    boot, _, made_s = made.partition(" ")
+    return time.monotonic() - float(made_s) if boot == boot_id() else math.inf
 
 
 def _state(console: Console, scan_id: str) -> Scan:
