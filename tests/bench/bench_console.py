@@ -35,7 +35,7 @@ BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 VIEWERS = 3
 _ARGUMENTS = ["--no-sandbox", "--disable-gpu"]
 _DEAF_S = 60.0
-_PAINTS, _SCANS, _KILLS = 5, 6, 3
+_PAINTS, _SCANS, _KILLS = 10, 20, 5
 _SETTLE_S = 3.0
 _WAIT_MS = 60_000
 _WHEN_PAINTED = """
@@ -256,7 +256,8 @@ def measure_paint(table: Table, console: LiveConsole, browser: Browser) -> None:
         times_ms.append(float(wait_for_value(page, "window.paintedMs")))
         context.close()
     slowest = max(times_ms)
-    table.row("first view painted, slowest of 5", f"{slowest:.0f} ms", "< 1000 ms", slowest < 1000)
+    what = f"first view painted, slowest of {_PAINTS}"
+    table.row(what, f"{slowest:.0f} ms", "< 1000 ms", slowest < 1000)
 
 
 def since_ms(page: Page, began: float) -> float:
@@ -281,8 +282,9 @@ def measure_results(table: Table, console: LiveConsole, context: BrowserContext)
         times_ms.append(since_ms(page, delivered.stat().st_ctime))
     page.close()
     times_ms.sort()
-    text = f"{times_ms[len(times_ms) // 2]:.0f} ms, worst {times_ms[-1]:.0f} ms"
-    table.row("a delivered result is on the page", text, "< 300 ms", times_ms[-1] < 300)
+    middle, p95 = (times_ms[round(share * (len(times_ms) - 1))] for share in (0.5, 0.95))
+    text = f"{middle:.0f}, p95 {p95:.0f}, worst {times_ms[-1]:.0f} ms"
+    table.row(f"a result is on the page, {_SCANS} scans", text, "< 300 ms", times_ms[-1] < 300)
 
 
 def outbox(console: LiveConsole) -> list[Path]:
