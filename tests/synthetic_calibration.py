@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.equations import center_equations, recentred
+from station.calibration.adjust.equations import ball_rows, center_equations, recentred
 from station.calibration.adjust.problem import Sightings
 from station.calibration.adjust.sensor_model import COARSE, image_place
 from station.calibration.detect.ball_image import ball_inverse_depth
@@ -188,7 +188,8 @@ def _ball(
     sightings = Sightings.of(believed, [seen])
     nothing = np.zeros(COARSE.size)
     detected = recentred(sightings, believed, COARSE, nothing, stated)
-    matrix, _ = center_equations(sightings, believed, COARSE, detected, nothing, stated)
+    rows = ball_rows(sightings, believed, COARSE, detected, nothing, stated)
+    matrix, _ = center_equations(sightings, rows)
     return replace(
         seen, center_m=detected[0], covariance_m2=np.linalg.inv(matrix[0, :3, :3]).astype(float)
     )

@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 Choice = tuple[int, ...]
 """Index of an option of each of ``CLASSES``."""
 
+_BEYOND = 1e300
+"""A corner that keeps a bordered matrix positive."""
 _UNLIKELY = 7.0
 """Fields and choices less likely by a factor e^7 than the best do not count."""
 
@@ -159,9 +161,10 @@ class _Field:
         self._values = base.values[inner]
         self._options = [options(name, len(base.cameras)) for name in CLASSES]
         self._precisions = [
-            [self._precision(name, option) for option in own]
+            np.stack([self._precision(name, option) for option in own])
             for name, own in zip(CLASSES, self._options, strict=True)
         ]
+        self._priors = [np.array([option.log_prior for option in own]) for own in self._options]
         self._log: dict[Choice, float] = {}
         self.best = self._search(start)
 
@@ -183,7 +186,7 @@ class _Field:
         likely = [(c, log) for c, log in self._log.items() if log > self.best[1] - _UNLIKELY]
         logs = np.array([log for _, log in likely])
         weights = np.exp(logs - logsumexp(logs))
-        precision = np.stack([self._diagonal(choice) for choice, _ in likely])
+        precision = self._diagonals([choice for choice, _ in likely])
         spread = np.linalg.inv(self._information + precision[:, None] * np.eye(len(self._values)))
         steps = -np.einsum("mij,mj->mi", spread, self._gradient + precision * self._values)
         mean = weights @ steps
@@ -213,8 +216,12 @@ class _Field:
             ]
         )
 
-    def _diagonal(self, choice: Choice) -> Array:
-        return np.concatenate([own[k] for own, k in zip(self._precisions, choice, strict=True)])
+    def _diagonals(self, choices: Sequence[Choice]) -> Array:
+        """Diagonals (n, m) of the priors' information of n choices."""
+        columns = np.array(choices).T
+        return np.concatenate(
+            [own[k] for own, k in zip(self._precisions, columns, strict=True)], axis=1
+        )
 
     def _search(self, start: Choice | None) -> tuple[Choice, float]:
         """The choice of the largest evidence, from the soundest and the widest of all."""
@@ -246,14 +253,19 @@ class _Field:
     def _weigh(self, choices: Sequence[Choice]) -> None:
         if not choices:
             return
-        precision = np.stack([self._diagonal(choice) for choice in choices])
-        right = self._gradient + precision * self._values
-        whole = self._information + precision[:, None] * np.eye(len(self._values))
+        precision, count = self._diagonals(choices), len(self._values)
+        # The factor's last row, of the right-hand side set below the matrix, is L^-1 right.
+        whole = np.empty((len(choices), count + 1, count + 1))
+        whole[:, :count, :count] = self._information + precision[:, None] * np.eye(count)
+        whole[:, count, :count] = self._gradient + precision * self._values
+        whole[:, :count, count] = whole[:, count, :count]
+        whole[:, count, count] = _BEYOND
         root = np.linalg.cholesky(whole)
-        half = np.linalg.solve(root, right[..., None])[..., 0]
+        half, diagonal = root[:, count, :count], np.einsum("mii->mi", root)[:, :count]
         log = 0.5 * np.sum(half**2, axis=1) - 0.5 * np.sum(precision * self._values**2, axis=1)
-        log -= np.log(np.einsum("mii->mi", root)).sum(axis=1)
+        log -= np.log(diagonal).sum(axis=1)
         log += 0.5 * np.log(precision).sum(axis=1) + self._constant
-        for choice, value in zip(choices, log, strict=True):
-            prior = sum(own[k].log_prior for own, k in zip(self._options, choice, strict=True))
-            self._log[choice] = float(value) + prior
+        log += np.stack(
+            [own[k] for own, k in zip(self._priors, np.array(choices).T, strict=True)]
+        ).sum(axis=0)
+        self._log.update(zip(choices, log.tolist(), strict=True))

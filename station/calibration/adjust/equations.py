@@ -89,12 +89,8 @@ class Balls:
         )
 
 
-def center_equations(
-    seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
-    parameters: Array, radius_m: float,
-) -> tuple[Array, Array]:  # fmt: skip
+def center_equations(seen: Sightings, rows: BallRows) -> tuple[Array, Array]:
     """H (n, 4, 4) and gradient (n, 4) of centre and radius, without the sensor's parameters."""
-    rows = _ball_rows(seen, camera, model, centers, parameters, radius_m)
     weighted = rows.jacobian * seen.weight[..., None]
     return (
         np.swapaxes(weighted, 1, 2) @ rows.jacobian,
@@ -103,11 +99,9 @@ def center_equations(
 
 
 def ball_equations(
-    seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
-    parameters: Array, radius_m: float, trust: Array,
-) -> Balls:  # fmt: skip
+    seen: Sightings, camera: CameraCalibration, model: SensorModel, rows: BallRows, trust: Array
+) -> Balls:
     """All equations, each detection weighed by its trust (n,)."""
-    rows = _ball_rows(seen, camera, model, centers, parameters, radius_m)
     weight = seen.weight * trust[:, None]
     weighted = rows.jacobian * weight[..., None]
     patches = seen.inverse.shape[1]
@@ -130,14 +124,18 @@ def recentred(
 ) -> Array:  # fmt: skip
     """Centres (n, 3) that each detection has by itself, given the sensor's parameters."""
     centers = seen.centers.copy()
+    ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
     for _ in range(4):
-        matrix, gradient = center_equations(seen, camera, model, centers, parameters, radius_m)
+        rows = _rows_along(ray, seen, model, centers, parameters, radius_m)
+        matrix, gradient = center_equations(seen, rows)
         centers -= np.linalg.solve(matrix[:, :3, :3], gradient[:, :3, None])[..., 0]
     return centers
 
 
 @dataclass(frozen=True, slots=True)
-class _Rows:
+class BallRows:
+    """Residuals (n, k) of the patches of n detections, and their derivatives."""
+
     residual: Array
     expected: Array
     """Measured inverse depth as it is expected."""
@@ -150,12 +148,19 @@ class _Rows:
     """(n, k)"""
 
 
-def _ball_rows(
+def ball_rows(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
     parameters: Array, radius_m: float,
-) -> _Rows:  # fmt: skip
-    lens = model.camera(camera, parameters)
-    ray = pixel_rays(lens, seen.pixels)
+) -> BallRows:  # fmt: skip
+    """Rows of balls with centres (n, 3), through a sensor with its parameters (U,)."""
+    ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
+    return _rows_along(ray, seen, model, centers, parameters, radius_m)
+
+
+def _rows_along(
+    ray: Array, seen: Sightings, model: SensorModel, centers: Array, parameters: Array,
+    radius_m: float,
+) -> BallRows:  # fmt: skip
     w, gradient = ball_inverse_depth(centers, ray, radius_m)
     # A side that is flatter by k stands k R (1 - cos^2) higher where it is so far off its middle.
     towards = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) / w[..., None]
@@ -167,7 +172,7 @@ def _ball_rows(
     flat = w.ravel()
     expected = flat - model.change(parameters, flat, place)
     change = model.change(parameters, expected, place).reshape(w.shape)
-    return _Rows(
+    return BallRows(
         seen.inverse + change - w,
         expected.reshape(w.shape),
         -gradient[..., :4],

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from station.calibration.adjust.looks import Fitness
 from station.calibration.adjust.normal import NormalEquations
 from station.calibration.adjust.problem import Layout, Problem, State, moved_state
 
@@ -39,10 +40,9 @@ def _settle(problem: Problem, start: State, iterations: int, informed: bool) -> 
         if size < _SETTLED:
             break
     # The detections tell how noisy they are, and nothing of priors and floors.
-    final = NormalEquations(problem, layout, state)
-    scale = final.scale()
-    state = replace(state, deviations=final.deviations, scale=scale, last_step=size)
+    fitness = Fitness.of(problem, state)
+    state = replace(state, deviations=fitness.deviations, scale=fitness.scale, last_step=size)
     if informed:
-        information, gradient = NormalEquations(problem, layout, state, scale).reduced()
+        information, gradient = NormalEquations(problem, layout, state, state.scale).reduced()
         state = replace(state, information=information, gradient=gradient)
     return state

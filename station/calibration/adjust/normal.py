@@ -17,9 +17,9 @@ from scipy.sparse import csr_matrix
 from station.calibration.adjust.equations import (
     Balls,
     ball_equations,
-    center_equations,
     plane_equations,
 )
+from station.calibration.adjust.looks import Look
 from station.calibration.adjust.problem import (
     BOW,
     FOOT,
@@ -44,17 +44,6 @@ TAPE_M = 0.001
 """Standard deviation of a height that was measured with a tape."""
 _TAIL = 4.0
 """Degrees of freedom (Student's t) of a contact that may be none."""
-_NEAR_M = 0.05
-"""Depth errors that are not corrected yet shift a ball along its ray, by less than that."""
-_BESIDE_M = 0.015
-"""A centre this little beside the detected one is where the equations are linear enough."""
-_GATE = 11.3
-"""Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
-_REJECT = 60.0
-_MIN_TYPICAL = 0.2
-"""Least typical deviation, as a share of the noise's variance."""
-MEDIAN = 2.366
-"""Median of chi-square with three degrees of freedom."""
 
 
 class NormalEquations:
@@ -69,9 +58,6 @@ class NormalEquations:
         self._coupling = np.zeros((layout.size, 3 * count))
         self._band = np.zeros((12, 3 * count))
         self._path_gradient = np.zeros(3 * count)
-        self.deviations: dict[str, Array] = {}
-        self._cost, self._seen = 0.0, 0.0
-        self._path_share = np.zeros(count)
         self._smooth()
         self._priors()
         for seen in problem.waved.values():
@@ -102,11 +88,6 @@ class NormalEquations:
         gradient = self._gradient - self._coupling @ self._band_solve(self._path_gradient)
         return np.asarray(0.5 * (reduced + reduced.T)), gradient
 
-    def scale(self) -> float:
-        """Observed over expected deviation of the detections' centres."""
-        unknowns = 3.0 * np.sum(np.abs(self._path_share) > 0.5) + 12 * len(self._problem.cameras)
-        return float(np.sqrt(self._cost / max(3.0 * self._seen - unknowns, 1.0)))
-
     def _band_solve(self, right: Array) -> Array:
         return np.asarray(cho_solve_banded((self._factor, False), right))
 
@@ -130,52 +111,25 @@ class NormalEquations:
             self._border[np.ix_(prior.index, prior.index)] += prior.information
             self._gradient[prior.index] += prior.information @ prior.values
 
-    def _balls(self, seen: Sightings, centers: Array, trust: Array) -> Balls:
-        problem, state = self._problem, self._state
-        return ball_equations(
-            seen, problem.cameras[seen.camera], problem.model, centers,
-            state.sensors[seen.camera], state.radius_m, trust,
-        )  # fmt: skip
-
-    def _deviation(self, seen: Sightings, centers: Array, at: Array, still: bool) -> Array:
-        """(n,): squared distance of each detection's own centre from the one assumed."""
-        problem, state = self._problem, self._state
-        matrix, gradient = center_equations(
-            seen, problem.cameras[seen.camera], problem.model, centers,
-            state.sensors[seen.camera], state.radius_m,
-        )  # fmt: skip
-        nothing = np.zeros((len(matrix), 4, 0))
-        balls = Balls(matrix, gradient, nothing, np.zeros((0, 0)), np.zeros(0)).moved(at - centers)
-        if not still:
-            balls = balls.off_center(problem.radius_m, np.ones(len(matrix)))
-        inner, right = balls.matrix[:, :3, :3], balls.gradient[:, :3]
-        return np.asarray(
-            np.einsum("ni,ni->n", right, np.linalg.solve(inner, right[..., None])[..., 0])
-        )
+    def _balls(self, seen: Sightings, look: Look, trust: Array) -> Balls:
+        problem = self._problem
+        return ball_equations(seen, problem.cameras[seen.camera], problem.model, look.rows, trust)
 
     def _add_waved(self, seen: Sightings) -> None:
         if not len(seen.times_s):
             return
         state, layout, name = self._state, self._layout, seen.camera
         pose = state.poses[name]
-        first, value, rate = state.grid.basis(seen.times_s + state.clock_s[name])
-        centers = (along(state.controls, first, value) - pose[:3, 3]) @ pose[:3, :3]
-        near = _near(centers, seen.centers)
-        deviation = self._deviation(seen, near, centers, still=False)
-        self.deviations[name] = deviation
-        robust = _robust_weight(deviation)
-        self._cost += float(np.sum(robust * np.minimum(deviation, _GATE)))
-        self._seen += float(np.sum(robust))
-        for k in range(4):
-            np.add.at(self._path_share, first + k, 0.25 * robust)
-        trust = self._trust * robust
-        balls = self._balls(seen, near, trust).moved(centers - near)
+        look = Look.along_path(self._problem, state, seen)
+        first, value, centers = look.first, look.value, look.centers
+        trust = self._trust * look.robust
+        balls = self._balls(seen, look, trust).moved(centers - look.near)
         balls = balls.off_center(self._problem.radius_m, trust)
 
         chain = np.zeros((len(centers), 4, FOOT + 1))
         chain[:, :3, :3] = skew(centers)
         chain[:, :3, 3:6] = -np.eye(3)
-        chain[:, :3, 6] = along(state.controls, first, rate) @ pose[:3, :3]
+        chain[:, :3, 6] = along(state.controls, first, look.rate) @ pose[:3, :3]
         chain[:, 3, 7] = 1.0
         index = np.concatenate([layout.camera(name)[:FOOT], layout.radius])
         sensor = layout.sensor(name)
@@ -207,10 +161,10 @@ class NormalEquations:
         pose, looks = state.poses[name], len(seen.times_s)
         center = (state.places[place] - pose[:3, 3]) @ pose[:3, :3]
         centers = np.repeat(center[None], looks, axis=0)
-        robust = _robust_weight(self._deviation(seen, centers, centers, still=True))
+        look = Look.at_rest(self._problem, state, seen, centers)
         # Looks at a still ball share the part of the noise that stays.
-        trust = self._trust * robust / (FROZEN_SHARE * looks + 1.0 - FROZEN_SHARE)
-        balls = self._balls(seen, centers, trust).summed()
+        trust = self._trust * look.robust / (FROZEN_SHARE * looks + 1.0 - FROZEN_SHARE)
+        balls = self._balls(seen, look, trust).summed()
         balls = balls.off_center(self._problem.radius_m, np.array([self._trust]))
         chain = np.zeros((1, 4, 6 + 3 + 1))
         chain[0, :3, :3], chain[0, :3, 3:6] = skew(center), -np.eye(3)
@@ -231,10 +185,12 @@ class NormalEquations:
     def _add_sensor(
         self, mixed: Array, index: Indices, sensor: Indices, matrix: Array, gradient: Array
     ) -> None:
-        self._border[np.ix_(index, sensor)] += mixed
-        self._border[np.ix_(sensor, index)] += mixed.T
-        self._border[np.ix_(sensor, sensor)] += matrix
-        self._gradient[sensor] += gradient
+        # A sensor's parameters follow one another: slices cost a tenth of what indices do.
+        own = slice(int(sensor[0]), int(sensor[-1]) + 1)
+        self._border[index, own] += mixed
+        self._border[own, index] += mixed.T
+        self._border[own, own] += matrix
+        self._gradient[own] += gradient
 
     def _add_surface(self, surface: Surface) -> None:
         problem, layout, state = self._problem, self._layout, self._state
@@ -289,30 +245,3 @@ def _path_rows(first: Indices, value: Array, rotation: Array, count: int) -> csr
     return csr_matrix(
         (data.ravel(), column.ravel(), np.arange(0, 12 * rows + 1, 12)), shape=(rows, 3 * count)
     )
-
-
-def _near(centers: Array, detected: Array) -> Array:
-    """Points of linearisation (n, 3): as far as the centres, but where the rays meet the ball.
-
-    The image of a ball does not tell how well a place decimetres away agrees with it.
-    """
-    ray = detected / np.linalg.norm(detected, axis=1, keepdims=True)
-    off = centers - detected
-    farther_m = np.einsum("ni,ni->n", off, ray)
-    beside_m = np.linalg.norm(off - farther_m[:, None] * ray, axis=1)
-    near = detected + np.clip(farther_m, -_NEAR_M, _NEAR_M)[:, None] * ray
-    usable = (beside_m < _BESIDE_M) & (np.abs(farther_m) < _NEAR_M)
-    return np.asarray(np.where(usable[:, None], centers, near))
-
-
-def _robust_weight(deviation: Array) -> Array:
-    """Weights (n,) that leave out what deviates far more than most do.
-
-    As long as depth errors are not yet corrected all deviate, and none may be left out for that.
-    Once they are most deviate by less than the noise that is assumed: fingers over the ball then
-    show, although they deviate by no more than that noise could.
-    """
-    typical = max(float(np.median(deviation)) / MEDIAN, _MIN_TYPICAL)
-    deviation = deviation / typical
-    far = np.minimum(1.0, _GATE / np.maximum(deviation, _GATE))
-    return np.where(deviation < _REJECT, far, 0.0)

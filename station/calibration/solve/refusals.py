@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.normal import MEDIAN
+from station.calibration.adjust.looks import MEDIAN
 from station.calibration.adjust.problem import State
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, Observations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from station.calibration.adjust.problem import Layout, Problem, State, moved_state
 from station.calibration.detect.detections import FLOOR, FRONT, MARK
-from station.core.geometry import adjoint, invert, rigid, twist_between
+from station.core.geometry import adjoint, invert, rigid, so3_log
 
 Array = NDArray[np.float64]
 
@@ -55,23 +55,24 @@ def world_from_reference(state: State, front_cameras: Sequence[str]) -> Array:
 def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Placed:
     """Every camera's pose in the world and the joint covariance of all of them."""
 
-    def poses(at: State) -> list[Array]:
+    def poses(at: State) -> Array:
         world = world_from_reference(at, front_cameras)
-        return [world @ at.poses[name] for name in problem.cameras]
+        return world @ np.stack([at.poses[name] for name in problem.cameras])
+
+    def twists(at: State) -> Array:
+        moves = back @ poses(at)
+        return np.concatenate([so3_log(moves[:, :3, :3]), moves[:, :3, 3]], axis=1).ravel()
 
     layout = Layout.of(problem)
     here = poses(state)
+    back = np.stack([invert(pose) for pose in here])
     jacobian = np.zeros((6 * len(here), layout.size))
     sigma = np.sqrt(np.diag(state.covariance))
     for i in layout.geometry:
         step = np.zeros(layout.size)
         step[i] = 0.1 * sigma[i]
-        ends = [poses(moved_state(problem, layout, state, sign * step)) for sign in (1.0, -1.0)]
-        twists = [
-            twist_between(pose, end) - twist_between(pose, other)
-            for pose, end, other in zip(here, *ends, strict=True)
-        ]
-        jacobian[:, i] = np.concatenate(twists) / (0.2 * sigma[i])
+        ends = [twists(moved_state(problem, layout, state, sign * step)) for sign in (1.0, -1.0)]
+        jacobian[:, i] = (ends[0] - ends[1]) / (0.2 * sigma[i])
     return Placed(
         jacobian=jacobian,
         world_from_camera=dict(zip(problem.cameras, here, strict=True)),
