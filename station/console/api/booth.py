@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 from fastapi import APIRouter, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from station.calibration.guide.store import CalibrationStore, Entry
 from station.console.api.console import (
@@ -55,15 +56,15 @@ def session(request: Request, console: Booth) -> Session:
 
 
 @router.post("/session", responses=responses(429), tags=["session"])
-def log_in(body: Login, request: Request, response: Response, console: Booth) -> Session:
+async def log_in(body: Login, request: Request, response: Response, console: Booth) -> Session:
     """Log in; the session is a cookie."""
     address = request.client.host if request.client else "?"
-    _check_password(console, address, body.password)
-    console.audit.note("operator", address, "log in")
+    # Who has to wait is refused at once, and takes no thread from those who are served.
+    _refuse_early(console, address)
     hours = console.config.console.session_hours
     response.set_cookie(
         COOKIE,
-        console.vault.open_session(hours),
+        await run_in_threadpool(_opened_session, console, address, body.password, hours),
         max_age=int(3600 * hours),
         httponly=True,
         samesite="strict",
@@ -73,15 +74,20 @@ def log_in(body: Login, request: Request, response: Response, console: Booth) ->
     return _session(console, Caller("operator", address, ("read", "scan", "manage")))
 
 
+def _opened_session(console: Console, address: str, password: str, hours: float) -> str:
+    """The secret of a session of whoever gives the right password."""
+    _check_password(console, address, password)
+    console.audit.note("operator", address, "log in")
+    return console.vault.open_session(hours)
+
+
 def _check_password(console: Console, address: str, password: str) -> None:
     """End the request unless this is the operator's password, given not too often."""
     # Not waited for: guesses sent all at once must not hold the threads that serve everybody.
     if not console.checking.acquire(blocking=False):
         raise _too_many("others are logging in just now", 1.0)
     try:
-        wait_s = console.throttle.wait_s(address, time.monotonic())
-        if wait_s > 0:
-            raise _too_many("too many wrong passwords", wait_s)
+        _refuse_early(console, address)
         if not console.vault.check_password(password):
             console.throttle.failed(address, time.monotonic())
             console.audit.note("?", address, "wrong password")
@@ -89,6 +95,13 @@ def _check_password(console: Console, address: str, password: str) -> None:
         console.throttle.succeeded(address)
     finally:
         console.checking.release()
+
+
+def _refuse_early(console: Console, address: str) -> None:
+    """End the request of an address that has sent too many wrong passwords."""
+    wait_s = console.throttle.wait_s(address, time.monotonic())
+    if wait_s > 0:
+        raise _too_many("too many wrong passwords", wait_s)
 
 
 def _too_many(what: str, wait_s: float) -> ProblemError:

@@ -162,7 +162,12 @@ def need(scope: Scope) -> Callable[[HTTPConnection], Caller]:
     return check
 
 
-Booth = Annotated[Console, Depends(console_of)]
+async def _console(connection: HTTPConnection) -> Console:
+    # As a coroutine it costs no thread, unlike a function.
+    return console_of(connection)
+
+
+Booth = Annotated[Console, Depends(_console)]
 Reader = Annotated[Caller, Depends(need("read"))]
 Scanner = Annotated[Caller, Depends(need("scan"))]
 Manager = Annotated[Caller, Depends(need("manage"))]
