@@ -6,6 +6,7 @@ limit of a job: one that dies is counted, and the next goes on behind it.
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import random
@@ -183,16 +184,18 @@ def _in_a_process(
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
-        os.close(reading)
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, 2)
-        resource.setrlimit(resource.RLIMIT_DATA, (_MAX_BYTES, _MAX_BYTES))
-        for case in batch:
-            words = _case(target, wholes, random.Random(f"{seed}.{case}"))
-            os.write(writing, b"!" if words else b".")
-            if words:
-                os.write(1, f"        {target.name} {seed}.{case}: {words:.200}\n".encode())
-        os._exit(0)
+        try:
+            os.close(reading)
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, 2)
+            resource.setrlimit(resource.RLIMIT_DATA, (_MAX_BYTES, _MAX_BYTES))
+            for case in batch:
+                words = _case(target, wholes, random.Random(f"{seed}.{case}"))
+                os.write(writing, b"!" if words else b".")
+                if words:
+                    os.write(1, f"        {target.name} {seed}.{case}: {words:.200}\n".encode())
+        finally:
+            os._exit(0)
     os.close(writing)
     with os.fdopen(reading, "rb") as said:
         marks = said.read()
@@ -287,7 +290,8 @@ def _put_something_strange(rng: random.Random, document: Any) -> None:
         if rng.random() < 0.1 and isinstance(document, dict):
             del document[key]
         else:
-            document[key] = rng.choice(STRANGE)
+            # A copy: the next strange thing may be put into this one.
+            document[key] = copy.deepcopy(rng.choice(STRANGE))
         return
 
 
