@@ -24,7 +24,7 @@ help:
 	@echo "make evaluate-model   tables of the body model on held-out bodies"
 	@echo "make intervals  learn the measurements' intervals, after any change to model or fit"
 	@echo "make test-faults   kill, stop, starve and fuzz the station: the short form (a minute)"
-	@echo "make soak     the long form, then scans for hours; ARGS=\"--minutes 600\""
+	@echo "make soak     the long form, then 1,440 scans; ARGS=\"--only soak --scans 100\""
 	@echo "make package  the Debian packages, wheel and source distribution of this commit, in dist/"
 	@echo "make test-install   install them on a fresh Debian under systemd and test them (root)"
 	@echo "make lock     update the packages' pinned dependencies"
@@ -43,7 +43,7 @@ test-faults: $(VENV)/dev.stamp
 
 soak: $(VENV)/dev.stamp
 	command -v cc >/dev/null || apt-get install -y --no-install-recommends gcc libc6-dev
-	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long --minutes 60 $(ARGS)
+	PYTHONPATH=tests $(BIN)/python tests/faults/harness/run.py --long $(ARGS)
 
 # The console in Debian's chromium; long: requests generated from its OpenAPI document.
 test-console test-console-long: $(VENV)/dev.stamp $(VENV)/browser.stamp

@@ -6,10 +6,13 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import psutil
+
+from station.core.service import die_with_parent
 
 STATION = (sys.executable, "-m", "station.cli")
 
@@ -17,13 +20,18 @@ STATION = (sys.executable, "-m", "station.cli")
 class Station:
     """A running station and its operator."""
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, variables: Mapping[str, str] | None = None) -> None:
+        """Start it; `variables` are added to its environment and to the operator's."""
         self.config = config
         self.log = config.parent / "station.log"
-        self._environment = {**os.environ, "BOOTH_CONFIG": str(config)}
+        self._environment = {**os.environ, "BOOTH_CONFIG": str(config), **(variables or {})}
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
-                [*STATION, "run"], env=self._environment, stdout=log, stderr=subprocess.STDOUT
+                [*STATION, "run"],
+                env=self._environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=partial(die_with_parent, os.getpid()),
             )
         try:
             self.wait_until(lambda: self.command("status").returncode == 0, "control answers")

@@ -1,4 +1,5 @@
-/* Faults at file calls, for LD_PRELOAD: the n-th call below a folder is killed, fails, or stalls.
+/* Faults at file calls, for LD_PRELOAD: the n-th call below a folder is killed, fails, or stalls;
+   and another wall clock.
 
    A process maps the file $BOOTH_FAULTS/<role>: who injects writes there when and what, and reads
    how many calls there were. The role is the first word of $BOOTH_FAULT_ROLES that stands on the
@@ -34,6 +35,7 @@ struct control {
     int64_t value;      /* errno; milliseconds; bytes a second */
     int64_t hits;       /* calls that were hit */
     int64_t changes;    /* not 0: calls that change nothing are not counted */
+    int64_t wall_s;     /* added to the wall clock */
     char folder[512];
     char call[64];      /* the call that was hit last */
 };
@@ -229,6 +231,14 @@ DIR *opendir(const char *path) {
     if (hit("opendir", 0, AT_FDCWD, path, 0))
         return 0;
     return real(path);
+}
+
+/* Files' times are the kernel's: only what a process believes about today jumps. */
+int clock_gettime(clockid_t clock, struct timespec *now) {
+    int failed = syscall(SYS_clock_gettime, clock, now);
+    if (!failed && control && clock == CLOCK_REALTIME)
+        now->tv_sec += control->wall_s;
+    return failed;
 }
 
 #define STAT(name, type)                                                                           \

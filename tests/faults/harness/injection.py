@@ -17,7 +17,9 @@ Action = Literal["count", "kill", "fail", "stall", "slow"]
 _ACTIONS = {"count": 3, "kill": 1, "fail": 2, "stall": 3, "slow": 4}
 _NEVER = 1 << 62
 _SOURCE = Path(__file__).parent / "faults.c"
-_WORDS, _FOLDER, _CALL = struct.Struct("7q"), 512, 64
+_WORDS, _FOLDER, _CALL = struct.Struct("8q"), 512, 64
+_ACTION, _WALL = 3 * 8, 7 * 8
+"""Where these words begin, bytes."""
 
 
 def build(folder: Path) -> Path:
@@ -40,6 +42,7 @@ class Injection:
     """One role: all processes with that word on their command line."""
 
     def __init__(self, folder: Path, role: str) -> None:
+        self._wall_s = 0
         size = _WORDS.size + _FOLDER + _CALL
         path = folder / role
         # The processes map the file at their start: one that is there is not made anew.
@@ -69,13 +72,18 @@ class Injection:
         where = os.fsencode(folder) + b"\0"
         self._memory[_WORDS.size : _WORDS.size + len(where)] = where
         last = min(_NEVER, first + count - 1)
-        words = (0, first, last, 0, value, 0, int(changes))
+        words = (0, first, last, 0, value, 0, int(changes), self._wall_s)
         self._memory[: _WORDS.size] = _WORDS.pack(*words)
-        struct.pack_into("q", self._memory, 24, _ACTIONS[action])
+        struct.pack_into("q", self._memory, _ACTION, _ACTIONS[action])
+
+    def move_wall_clock(self, seconds: int) -> None:
+        """Let the wall clock be ahead of the true one."""
+        self._wall_s = seconds
+        struct.pack_into("q", self._memory, _WALL, seconds)
 
     def disarm(self) -> None:
         """No more faults; the counts stay."""
-        struct.pack_into("q", self._memory, 24, 0)
+        struct.pack_into("q", self._memory, _ACTION, 0)
 
     @property
     def calls(self) -> int:

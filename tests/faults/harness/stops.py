@@ -1,0 +1,74 @@
+"""SIGSTOP of each process: it is named, then replaced, and nothing else suffers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import time
+from pathlib import Path
+
+from booth import WAIT_S, Booth, free_port, running_booth, until
+from table import Row
+
+_NAMED_S, _REPLACED_S = 5.0, 15.0
+_GAP_S = 1.0
+"""The longest time without a new frameset that counts as unharmed: reports are 0.25 s apart."""
+_SETTINGS = """
+[spool]
+min_free_mb = 50
+[console]
+port = {port}
+[[deliver]]
+name = "shop"
+folder = "handed"
+"""
+
+
+def stop_rows(only: tuple[str, ...] = ()) -> list[Row]:
+    """Stop each process of a booth with console and hand-over, or only some."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "handed").mkdir()
+        settings = _SETTINGS.format(port=free_port())
+        with running_booth(folder, settings=settings) as (booth, scans):
+            rows = [_stop(booth, process) for process in only or booth.processes()]
+            scans.take()
+            scans.settle()
+            rows.append(scans.row("a scan after all of them"))
+    return rows
+
+
+def _stop(booth: Booth, name: str) -> Row:
+    booth.wait(booth.well, f"the booth is whole before {name} is stopped")
+    others = {other: booth.pids(other) for other in booth.processes() if other != name}
+    [victim, *_] = booth.pids(name)
+    stopped_s = time.monotonic()
+    os.kill(victim, signal.SIGSTOP)
+    named_s = until(lambda: any(name in problem for problem in booth.problems()))
+    needed = name == "sync" or name.startswith("capture")
+    gap_s = 0.0 if needed else _longest_gap_s(booth, name, victim)
+    until(lambda: booth.replaced(name, victim))
+    replaced_s = time.monotonic() - stopped_s
+    changed = [other for other, pids in others.items() if booth.pids(other) != pids]
+    seen = f"named {named_s:.1f} s, replaced {replaced_s:.1f} s, others restarted: {len(changed)}"
+    return Row(
+        f"SIGSTOP of {name}",
+        f"named in {_NAMED_S:g} s, replaced in {_REPLACED_S:g} s, rest unharmed",
+        seen if needed else f"{seen}, longest gap {gap_s:.1f} s",
+        named_s <= _NAMED_S and replaced_s <= _REPLACED_S and not changed and gap_s <= _GAP_S,
+        timed=True,
+    )
+
+
+def _longest_gap_s(booth: Booth, name: str, victim: int) -> float:
+    """The longest time without a new frameset until the process is replaced."""
+    began_s = last_s = time.monotonic()
+    known, longest_s = booth.framesets(), 0.0
+    while not booth.replaced(name, victim) and time.monotonic() - began_s < WAIT_S:
+        now_s, count = time.monotonic(), booth.framesets()
+        longest_s = max(longest_s, now_s - last_s)
+        if count != known:
+            known, last_s = count, now_s
+        time.sleep(0.02)
+    return longest_s
