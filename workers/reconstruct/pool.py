@@ -171,7 +171,7 @@ def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
     """Recover scans whose worker died; returns a description of any obstacle."""
     try:
         for scan_id in spool.recover(config.workers.retries):
-            words = "scan %s is put back: its worker has died"
+            words = "scan %s is put back: work on it was interrupted"
             log.warning(words, scan_id, extra={"scan": scan_id})
     except OSError as error:
         return f"the spool cannot be looked through ({error}); check its disk"
