@@ -175,6 +175,13 @@ class Scans:
         self.told[scan_id] = self._booth.command("scan", "--no-wait", "--scan-id", scan_id, *words)
         return scan_id
 
+    def take_until_accepted(self, limit_s: float = WAIT_S) -> str:
+        """Order scans until one is accepted, or the time is up; returns the last one's id."""
+        began_s = time.monotonic()
+        while not self.accepted(scan_id := self.take()) and time.monotonic() - began_s < limit_s:
+            time.sleep(0.1)
+        return scan_id
+
     def accepted(self, scan_id: str) -> bool:
         return self.told[scan_id][0] == 0
 

@@ -40,19 +40,19 @@ def job_rows() -> list[Row]:
 
 def _always(booth: Booth, scans: Scans, order: str) -> Row:
     booth.order_job(order)
-    scan_id = scans.take()
+    scan_id = scans.take_until_accepted()
     reason = booth.spool / "failed" / scan_id / REASON
     until(reason.exists)
     booth.order_job("")
     told: dict[str, Any] = {"reason": "", "tries": 0}
     if reason.exists():
         told = json.loads(reason.read_text())
-    after = scans.take()
+    after = scans.take_until_accepted()
     scans.settle()
     came = scans.delivered()[after]
     return Row(
         f"jobs: {order}",
-        "retried, failed with the reason, the next comes",
+        "failed with the reason, the next one comes",
         f"{told['tries']} tries: {told['reason'][:90]}; the next came {came} times",
         bool(told["reason"]) and _WORDS[order] in told["reason"] and came == 1,
     )
@@ -60,7 +60,7 @@ def _always(booth: Booth, scans: Scans, order: str) -> Row:
 
 def _once(booth: Booth, scans: Scans) -> Row:
     booth.order_job("segfault")
-    scan_id = scans.take()
+    scan_id = scans.take_until_accepted()
     note = booth.spool / "scans" / f"{scan_id}.json"
     until(lambda: json.loads(note.read_text())["tries"] > 0)
     booth.order_job("")

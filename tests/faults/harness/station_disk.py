@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -105,12 +105,9 @@ def _next_delivered_s(scans: Scans, meanwhile: threading.Thread | None = None) -
     began_s = time.monotonic()
     if meanwhile is not None:
         meanwhile.join()
-    while time.monotonic() - began_s < 2 * _RETURN_S:
-        scan_id = scans.take()
-        if scans.accepted(scan_id):
-            until(partial(scans.came, scan_id), 3 * _RETURN_S)
-            break
-        time.sleep(0.1)
+    scan_id = scans.take_until_accepted(2 * _RETURN_S)
+    if scans.accepted(scan_id):
+        until(partial(scans.came, scan_id), 3 * _RETURN_S)
     return time.monotonic() - began_s
 
 
@@ -221,9 +218,9 @@ def _mounted(folder: Path) -> Iterator[None]:
 def _filled(booth: Booth, left_mb: int = _LEFT_MB) -> Iterator[None]:
     """Fill the spool's disk; a scan needs 50 MB and a bundle's room to be begun."""
     ballast = booth.spool / "tmp" / f"ballast.{os.getpid()}.1"
-    free = psutil.disk_usage(str(booth.spool)).free
-    with ballast.open("wb") as stream:
-        os.posix_fallocate(stream.fileno(), 0, free - (left_mb << 20))
+    with ballast.open("wb", buffering=0) as stream, suppress(OSError):
+        while psutil.disk_usage(str(booth.spool)).free > left_mb << 20:
+            stream.write(bytes(1 << 18))
     try:
         yield
     finally:
