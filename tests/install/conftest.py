@@ -20,44 +20,57 @@ _SUITE_BAR_S = 300.0
 _BEGAN_S = time.monotonic()
 
 
-def build(commit: str, out: Path, work: Path) -> Path:
+def build(commit: str, out: Path, work: Path, nice: int) -> Path:
     """The Debian package of a commit, made with its wheel and source distribution in `out`."""
-    command = [sys.executable, str(ROOT / "deploy/package/build.py"), "--commit", commit]
+    python = ["nice", "-n", str(nice), sys.executable]
+    command = [*python, str(ROOT / "deploy/package/build.py"), "--commit", commit]
     folders = ["--out", str(out), "--work", str(work), "--keep", str(WORK / "dependencies")]
     subprocess.run([*command, *folders], check=True, stdout=subprocess.DEVNULL)
     (package,) = out.glob("body-booth_*.deb")
     return package
 
 
-def _package(revision: str) -> Path:
+def _package(revision: str, nice: int = 0) -> Path:
     words = ["git", "rev-parse", "--verify", revision]
     commit = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
     out = WORK / "packages" / commit.stdout.strip()
     made = list(out.glob("body-booth_*.deb"))
-    return made[0] if made else build(revision, out, WORK / "build" / out.name)
+    return made[0] if made else build(revision, out, WORK / "build" / out.name, nice)
 
 
 @pytest.fixture(scope="session")
-def prepared() -> Iterator[tuple[Future[Path], Future[Path]]]:
-    """Packages of this commit and of the one before, built while the machine is made."""
-    with ThreadPoolExecutor(1) as builder:
-        yield builder.submit(_package, "HEAD"), builder.submit(_package, "HEAD~1")
+def builder() -> Iterator[ThreadPoolExecutor]:
+    """A thread that builds one package after the other."""
+    with ThreadPoolExecutor(1) as builds:
+        yield builds
 
 
 @pytest.fixture(scope="session")
-def package(prepared: tuple[Future[Path], Future[Path]]) -> Path:
+def prepared(builder: ThreadPoolExecutor) -> Future[Path]:
+    """The package of this commit, built while the machine is made."""
+    return builder.submit(_package, "HEAD")
+
+
+@pytest.fixture(scope="session")
+def prepared_before(builder: ThreadPoolExecutor) -> Future[Path]:
+    """The package of the commit before, built while tests wait for processes."""
+    return builder.submit(_package, "HEAD~1", nice=19)
+
+
+@pytest.fixture(scope="session")
+def package(prepared: Future[Path]) -> Path:
     """The Debian package of this commit (what is not committed is not in it)."""
-    return prepared[0].result()
+    return prepared.result()
 
 
 @pytest.fixture(scope="session")
-def package_before(prepared: tuple[Future[Path], Future[Path]]) -> Path:
+def package_before(prepared_before: Future[Path]) -> Path:
     """The Debian package of the commit before."""
-    return prepared[1].result()
+    return prepared_before.result()
 
 
 @pytest.fixture(scope="session")
-def base(prepared: tuple[Future[Path], Future[Path]]) -> Path:
+def base(prepared: Future[Path]) -> Path:
     """A minimal Debian with the package's dependencies and nothing of the booth."""
     assert prepared
     return base_root(DEBIAN, dependencies_of_package())

@@ -10,6 +10,7 @@ import json
 import re
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -109,7 +110,8 @@ def test_three_commands_lead_to_the_first_scan(
     TABLE.add("installed size", int(size) / 1000, _SIZE_BAR_MB, "MB")
 
 
-def test_setup_again_changes_nothing(machine: Machine) -> None:
+def test_setup_again_changes_nothing(machine: Machine, prepared_before: Future[Path]) -> None:
+    assert prepared_before  # the other package is built from now on
     before = _kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)}
     assert ", kept" in machine.run("station", "setup").stdout
     assert before == (_kept(machine), {unit: _shown(machine, unit) for unit in _services(machine)})
@@ -185,7 +187,8 @@ def test_a_reset_loses_no_accepted_scan(machine: Machine, moment: str) -> None:
         time.sleep(0.4)
     else:
         work = machine.root / STATE.lstrip("/") / "spool/work"
-        _until(lambda: any(work.iterdir()), "a worker claims the scan")
+        # The bundle of the scan before may still be there.
+        _until(lambda: any(p.name not in before for p in work.iterdir()), "a scan is claimed")
     machine.reset()
     scan.wait(timeout=10)
     accepted = _accepted(machine)
