@@ -5,17 +5,19 @@ from __future__ import annotations
 import gzip
 import hashlib
 import mimetypes
-from collections.abc import Iterable
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from starlette.datastructures import Headers
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 _SMALLEST_PACKED = 500
 """Bytes; below, packing saves no packet."""
 _LEVEL = 5
+_PIECE_BYTES = 32 << 10
+"""What is kept at once for a reader that reads nothing."""
 _TYPES = {".js": "text/javascript", ".svg": "image/svg+xml"}
 
 
@@ -51,8 +53,19 @@ class Asset:
         accepts = (word.partition(";")[0].strip() for word in _encodings(request))
         if self.packed and "gzip" in accepts:
             headers["content-encoding"] = "gzip"
-            return Response(self.packed, headers=headers, media_type=self.media_type)
-        return Response(self.plain, headers=headers, media_type=self.media_type)
+            return self._sent(self.packed, headers)
+        return self._sent(self.plain, headers)
+
+    def _sent(self, content: bytes, headers: dict[str, str]) -> Response:
+        if len(content) <= _PIECE_BYTES:
+            return Response(content, headers=headers, media_type=self.media_type)
+        headers["content-length"] = str(len(content))
+        return StreamingResponse(_pieces(content), headers=headers, media_type=self.media_type)
+
+
+async def _pieces(content: bytes) -> AsyncIterator[bytes]:
+    for start in range(0, len(content), _PIECE_BYTES):
+        yield content[start : start + _PIECE_BYTES]
 
 
 def _encodings(request: Headers) -> Iterable[str]:
