@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from station.core.errors import ConfigError
 from station.sensors.freenect import FreenectCamera
 
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 USUAL_NAMES = ("front-lower", "front-upper", "back-lower", "back-upper")
 
 
@@ -21,7 +23,8 @@ def name_cameras(serials: Sequence[str], given: Sequence[str]) -> list[FreenectC
     """Cameras with their names: those given as NAME=SERIAL first, the usual names for the others.
 
     Raises:
-        ConfigError: a pair is not NAME=SERIAL, or names a sensor that is not connected.
+        ConfigError: a pair is not NAME=SERIAL, or names a sensor that is not connected; a name
+            cannot be used, or stands for two sensors; a sensor gets two names.
     """
     pairs: dict[str, str] = {}
     for words in given:
@@ -29,6 +32,10 @@ def name_cameras(serials: Sequence[str], given: Sequence[str]) -> list[FreenectC
         if not separator or serial not in serials:
             known = ", ".join(serials) or "none"
             raise ConfigError(f"--camera {words}: give NAME=SERIAL; connected sensors: {known}")
+        if not _NAME.fullmatch(name):
+            raise ConfigError(f"--camera {words}: a name has letters, digits, '-' and '_' only")
+        if serial in pairs or name in pairs.values():
+            raise ConfigError(f"--camera {words}: this name or this sensor is given twice")
         pairs[serial] = name
     free = iter(name for name in _names(len(serials)) if name not in pairs.values())
     return [

@@ -94,6 +94,14 @@ def test_sensors_get_the_names_that_were_given(tmp_path: Path) -> None:
     assert load_config(path).cameras == tuple(cameras)
     with pytest.raises(ConfigError, match="connected sensors: A"):
         name_cameras(["A"], ["front=Z"])
+    for pairs, reason in (
+        (["one=A", "one=B"], "twice"),
+        (["one=A", "two=A"], "twice"),
+        (["a b=A"], "letters, digits"),
+        (["=A"], "letters, digits"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            name_cameras(["A", "B"], pairs)
 
 
 def test_a_sensor_that_was_replaced_is_named_with_the_new_one() -> None:
