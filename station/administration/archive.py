@@ -23,7 +23,8 @@ VERSION = 1
 
 
 _DATABASE = ".sqlite"
-_JOURNALS = (f"*{_DATABASE}-wal", f"*{_DATABASE}-shm")
+_JOURNAL_ENDS = (f"{_DATABASE}-wal", f"{_DATABASE}-shm")
+_JOURNALS = tuple(f"*{end}" for end in _JOURNAL_ENDS)
 _SCRATCH = ("tmp", "locks")
 """Folders of a spool that mean nothing without the processes that use them."""
 
@@ -82,9 +83,15 @@ def part(name: str, config_path: Path, config: BoothConfig) -> Part:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """List a folder without names that begin with a dot and without scratch."""
+    """List a folder without names that begin with a dot, scratch, and journals of databases."""
     found = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in found if path.name[0] != "." and path.name not in _SCRATCH]
+    return [
+        path
+        for path in found
+        if path.name[0] != "."
+        and path.name not in _SCRATCH
+        and not path.name.endswith(_JOURNAL_ENDS)
+    ]
 
 
 def save(

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from pathlib import Path
 
 from station.core.errors import BoothError
 
 TARGET = "booth.target"
+_STOPPING_S = 30.0
+"""More than any service's TimeoutStopSec."""
+_ALIVE = (
+    "list-units", "--plain", "--no-legend", "--type=service",
+    "--state=active,activating,deactivating,reloading", "booth-*",
+)  # fmt: skip
 _PLACE = Path("/usr/lib/systemd/system") / TARGET
 
 
@@ -17,8 +24,18 @@ def installed() -> bool:
 
 
 def running() -> bool:
-    """Whether the booth's target is up."""
-    return installed() and _systemctl("--quiet", "is-active", TARGET).returncode == 0
+    """Whether the booth's target is up; services that are still stopping are waited for."""
+    if not installed():
+        return False
+    if _systemctl("--quiet", "is-active", TARGET).returncode == 0:
+        return True
+    # `systemctl stop` of a target returns before its services have ended.
+    deadline_s = time.monotonic() + _STOPPING_S
+    while busy := _systemctl(*_ALIVE).stdout.strip():
+        if time.monotonic() > deadline_s:
+            break
+        time.sleep(0.1)
+    return bool(busy)
 
 
 def start(*, afresh: bool) -> None:

@@ -190,6 +190,18 @@ def test_a_database_is_saved_while_it_is_written(booth: Path, tmp_path: Path) ->
         assert restored.execute("SELECT name FROM token").fetchall() == [("till",)]
 
 
+def test_journals_that_a_killed_process_left_are_no_parts(booth: Path, tmp_path: Path) -> None:
+    index = booth.parent / "spool/index.sqlite"
+    with closing(sqlite3.connect(index)) as live:
+        live.execute("PRAGMA journal_mode = WAL")
+        live.execute("CREATE TABLE scans (name TEXT)")
+        assert index.with_name("index.sqlite-shm").exists()
+        saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=True)
+    names = [path.name for path in (saved / "content/spool").iterdir()]
+    assert "index.sqlite" in names
+    assert not any(name.endswith(("-wal", "-shm")) for name in names)
+
+
 @pytest.mark.parametrize("fault", ["changed", "missing", "extra", "version", "name"])
 def test_a_damaged_backup_changes_nothing(booth: Path, tmp_path: Path, fault: str) -> None:
     saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
