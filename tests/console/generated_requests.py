@@ -7,6 +7,7 @@ is how many each operation gets.
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from typing import Any
 
@@ -28,6 +29,9 @@ _CHECKS = [
     response_schema_conformance,
 ]  # fmt: skip
 sent: Counter[int] = Counter()
+_STARVED = 503
+"""A machine that does much else lets a process miss its time; the answer says to try again."""
+_TRIES, _PAUSE_S = 30, 1.0
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +54,12 @@ def test_every_answer_is_documented(
             known = name in (case.path_parameters or {}) and case.method.upper() != "DELETE"
             if known and sum(sent.values()) % 2:
                 case.path_parameters[name] = scans[0]["scan_id"]
-        response = case.call(base_url=console.url, headers=token, timeout=60)
-        sent[response.status_code] += 1
+        for _ in range(_TRIES):
+            response = case.call(base_url=console.url, headers=token, timeout=60)
+            sent[response.status_code] += 1
+            if response.status_code != _STARVED:
+                break
+            time.sleep(_PAUSE_S)
         case.validate_response(response, checks=_CHECKS)
 
     failed = []
@@ -74,9 +82,11 @@ def test_every_answer_is_documented(
 def test_the_station_is_unharmed(console: LiveConsole) -> None:
     """Runs last: everything still works."""
     print(f"{sum(sent.values())} requests: {dict(sorted(sent.items()))}")
-    assert not any(status >= 500 and status != 503 for status in sent)
+    assert not any(status >= 500 and status != _STARVED for status in sent)
     with console.client() as client:
         client.delete("/task")
-        assert client.get("/booth").json()["running"]
+        console.station.wait_until(
+            lambda: bool(client.get("/booth").json()["running"]), "the station runs"
+        )
     console.start_sensors()
     assert console.scan("after all that")["state"] in ("delivered", "rescan")
