@@ -56,7 +56,8 @@ export async function booth(main) {
       [t('booth.disk'), `${(state.disk_free_mb / 1000).toFixed(1)} GB`],
       [t('booth.calibration'), calibrated(state.calibration)],
     ];
-    facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name), h('dd', {}, value)]));
+    facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name),
+      h('dd', { className: value.length > 12 ? 'wide' : '' }, value)]));
     const fault = !state.running ? t('booth.notRunning', { fault: said(state.fault) })
       : state.disk_free_mb < 1.5 * state.disk_needed_mb ? t('booth.diskLow') : '';
     banner.hidden = !fault;
