@@ -82,11 +82,11 @@ class Booth:
         return 0, ""
 
     def order_job(self, order: str) -> None:
-        """What the jobs do from now on; see `inside/errant_job.py`."""
+        """Change what the jobs do from now on; see `inside/errant_job.py`."""
         (self.folder / "job").write_text(order)
 
     def order_sensor(self, camera: str, fault: str) -> None:
-        """What a sensor does from now on; see `inside/played_sensor.py`."""
+        """Change what a sensor does from now on; see `inside/played_sensor.py`."""
         beside = self.folder / f"{camera}.new"
         beside.write_text(fault)
         beside.replace(_fault_file(self.folder, camera))
@@ -186,7 +186,7 @@ class Scans:
         return self.told[scan_id][0] == 0
 
     def delivered(self) -> Counter[str]:
-        """How often each scan came."""
+        """Count the deliveries of each scan."""
         return Counter(path.name.split(".")[0] for path in self._room.iterdir())
 
     def came(self, scan_id: str) -> bool:
@@ -212,7 +212,7 @@ class Scans:
         self._taking_away.join()
 
     def row(self, fault: str) -> Row:
-        """What the operator was told, compared with what came."""
+        """Statements of the station, compared with what came."""
         came = self.delivered()
         sure = {scan: code for scan, (code, words) in self.told.items() if not _unsure(words)}
         lost = [scan for scan, code in sure.items() if code == 0 and not came[scan]]

@@ -19,7 +19,7 @@ _NEVER = 1 << 62
 _SOURCE = Path(__file__).parent / "faults.c"
 _WORDS, _FOLDER, _CALL = struct.Struct("8q"), 512, 64
 _ACTION, _WALL = 3 * 8, 7 * 8
-"""Where these words begin, bytes."""
+"""Offsets of these words, bytes."""
 
 
 def build(folder: Path) -> Path:

@@ -29,7 +29,7 @@ BODY = Path(__file__).parents[3] / "station/simulation/bodies/ann.npz"
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How much is done."""
+    """Extent of the table."""
 
     long: bool
     seed: int

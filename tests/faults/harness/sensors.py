@@ -21,7 +21,7 @@ _FAULTS = ("silent", "half", "frozen", "stuck", "unplugged", "swapped")
 _CLOCKS = ("drift 500", "drift -500", "reset")
 _WATCHED_S = 2.0
 _REPORTED_S = 0.6
-"""What sync counted before the fault is in its reports by then."""
+"""Delay after which sync's reports hold no count from before the fault."""
 
 
 def sensor_rows(rounds: int, seed: int) -> list[Row]:

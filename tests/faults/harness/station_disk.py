@@ -35,7 +35,7 @@ enabled = false
 """
 _STALLS_S = (0.1, 0.5, 2.0, 4.0, 7.0, 10.0)
 _TRUE_WORDS = ("disk", "expired", "interrupted", "is being taken")
-"""What may be said of a scan that was refused because a disk stalled."""
+"""Words on a scan that was refused because a disk stalled; one of them is true."""
 _SLOW_BYTES_S = 1_000_000
 _SMALL_MB, _LEFT_MB = 400, 70
 
