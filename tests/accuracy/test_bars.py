@@ -1,8 +1,7 @@
-"""The benchmarks of fit, measurements and calibration in a short form: a few bodies, one booth.
+"""The benchmarks of fit and measurements in a short form: a few bodies.
 
-`make bench-fit`, `make bench-measure` and `make bench-calibration` run the same code on more bodies
-and booths and print each bar as met or missed. The limits of fit and measurements lie just above
-what is reached, to notice when it gets worse; those of the calibration are the bars themselves.
+`make bench-fit` and `make bench-measure` run the same code on more bodies and print each bar as met
+or missed. The limits lie just above what is reached, to notice when it gets worse.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import synthetic_calibration as synthetic
-from bench_calibration import judged
 from bench_fit import fitted, render_all
 from bench_measure import Table, measured_in, table_of
 from fit_cases import Case, TestBodies, family_cases, hard_cases
@@ -24,7 +21,6 @@ from unlike_bodies import UnlikeBodies
 from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
-from station.simulation.procedure import VirtualProcedure
 from station.simulation.sensor import SimulatedBooth
 from workers.cloud.preprocess import preprocess
 from workers.scape.fit.fit import fit_body
@@ -102,21 +98,3 @@ def test_nothing_is_lost_unnamed(model: BodyModel, tmp_path: Path) -> None:
     assert {row.case.name: row.lost_unnamed for row in _fitted(model, cases, tmp_path)} == {
         name: [] for name in HARD
     }
-
-
-def test_a_calibrated_booth_keeps_the_bars() -> None:
-    """The bars of the calibration on one booth, and what scans gain or lose by it.
-
-    Detections are drawn directly: finding them in a minute of images takes minutes, and is tested
-    with real processes in tests/e2e/test_replayed_calibration.py.
-    """
-    procedure = VirtualProcedure(synthetic.booth(1))
-    row = judged(procedure, synthetic.observations(procedure, rate_hz=20.0))
-    assert not isinstance(row, str), row
-    assert len(row.shift_mm) == 6
-    assert row.shift_mm.mean() < 1.0
-    assert row.shift_mm.max() < 2.0
-    assert row.turn_deg.mean() < 0.05
-    assert row.turn_deg.max() < 0.1
-    assert row.cylinder_mm < 1.5
-    assert row.body_mm - row.body_true_mm < 0.5

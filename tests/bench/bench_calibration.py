@@ -24,13 +24,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import bench_drift
 import synthetic_calibration as synthetic
+from calibrated_booths import normalised_square, pair_errors, solved
 
 from station.calibration.detect.detections import Observations
-from station.calibration.solve.solution import solve
-from station.calibration.solve.world import relatives
 from station.core.bundle import read_bundle
 from station.core.errors import CalibrationError
-from station.core.geometry import invert, twist_between
 from station.core.rig import Rig
 from station.simulation.observations import simulate
 from station.simulation.procedure import VirtualProcedure
@@ -42,7 +40,6 @@ Array = NDArray[np.float64]
 
 _BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 _CYLINDER_M = (0.15, 1.7)
-_REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,43 +69,23 @@ def calibrate(seed: int) -> Row | str:
 
 def judged(procedure: VirtualProcedure, observations: Observations) -> Row | str:
     """Solve and judge a booth from its detections; words if it is refused."""
-    booth, cameras = procedure.booth, synthetic.factory(procedure.booth.rig)
+    booth = procedure.booth
     start_s = time.perf_counter()
     try:
-        solution = solve(
-            observations, cameras, radius_m=procedure.radius_m, reference=_REFERENCE,
-            front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
-        )  # fmt: skip
+        solution = solved(booth.rig, observations, procedure.radius_m)
     except CalibrationError as refusal:
         return f"{booth.seed:<7}refused: {refusal}"
     seconds = time.perf_counter() - start_s
-    names, truth = list(cameras), booth.rig.cameras
-    errors = []
-    for i, a in enumerate(names):
-        found, _ = relatives(solution.placed, a, names[i + 1 :])
-        for b, a_from_b in zip(names[i + 1 :], found, strict=True):
-            true = invert(truth[a].world_from_camera) @ truth[b].world_from_camera
-            errors.append(twist_between(a_from_b, true))
-    others = [name for name in names if name != _REFERENCE]
-    found, covariance = relatives(solution.placed, _REFERENCE, others)
-    away = np.concatenate(
-        [
-            twist_between(
-                pose, invert(truth[_REFERENCE].world_from_camera) @ truth[b].world_from_camera
-            )
-            for b, pose in zip(others, found, strict=True)
-        ]
-    )
     with tempfile.TemporaryDirectory() as folder:
         cylinder_mm = _cylinder(booth, solution.rig, Path(folder) / "cylinder")
         body_mm, body_true_mm = _body(booth, solution.rig, Path(folder) / "body")
-    twists = np.array(errors)
+    twists = pair_errors(booth.rig, solution.placed)
     return Row(
         booth.seed,
         1e3 * np.linalg.norm(twists[:, 3:], axis=1),
         np.degrees(np.linalg.norm(twists[:, :3], axis=1)),
-        float(away @ np.linalg.solve(covariance, away)),
-        len(away),
+        normalised_square(booth.rig, solution.placed),
+        6 * (len(booth.rig.cameras) - 1),
         cylinder_mm,
         body_mm,
         body_true_mm,
@@ -159,14 +136,10 @@ def refusals() -> None:
     """Sessions that must be refused, and the operator's messages."""
     procedure = VirtualProcedure(synthetic.booth(101))
     seen = synthetic.observations(procedure)
-    cameras = synthetic.factory(procedure.booth.rig)
     print("\nrefused")
     for fault in synthetic.FAULTS:
         try:
-            solve(
-                fault.spoil(seen), cameras, radius_m=fault.radius_m, reference=_REFERENCE,
-                front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
-            )  # fmt: skip
+            solved(procedure.booth.rig, fault.spoil(seen), fault.radius_m)
             print(f"  MISSED  {fault.name}")
         except CalibrationError as refusal:
             print(

@@ -18,13 +18,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import synthetic_calibration as synthetic
+from calibrated_booths import normalised_square, pair_errors, solved
 from scan_distortion import Distortion, distortion
 
 from station.calibration.detect.detections import Observations
-from station.calibration.solve.solution import Solution, solve
-from station.calibration.solve.world import relatives
 from station.core.errors import CalibrationError
-from station.core.geometry import invert, twist_between
 from station.simulation import violations
 from station.simulation.observations import simulate
 from station.simulation.procedure import VirtualProcedure
@@ -32,7 +30,6 @@ from station.simulation.scene import load_mesh
 from station.simulation.sensor import SimulatedBooth
 
 _BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
-_REFERENCE, _FRONT = "front-upper", ("front-upper", "front-lower")
 CASES: dict[str, tuple[str, ...]] = {
     "clean": (),
     "bias": (violations.BIAS,),
@@ -65,14 +62,13 @@ def judge(name: str, seed: int, images: bool) -> str:
     seen = observe(booth, images)
     start_s = time.process_time()
     try:
-        solution = solve(
-            seen, synthetic.factory(booth.rig), radius_m=0.1, reference=_REFERENCE,
-            front_cameras=_FRONT, created="2026-01-01T00:00:00Z",
-        )  # fmt: skip
+        solution = solved(booth.rig, seen)
     except CalibrationError as refusal:
         return f"{name:<20}{seed:>4}  refused: {refusal}"
     seconds = time.process_time() - start_s
-    shifts, chi2 = _pairs(booth, solution)
+    shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.placed)[:, 3:], axis=1)
+    unknowns = 6 * (len(booth.rig.cameras) - 1)
+    chi2 = normalised_square(booth.rig, solution.placed) / unknowns
     found: Distortion = distortion(booth, solution.rig, load_mesh(_BODY))
     predicted = solution.rig.predicted
     assert predicted is not None
@@ -97,28 +93,6 @@ def judge(name: str, seed: int, images: bool) -> str:
         f"{1e3 * solution.rig.residual_rms_m:6.2f}{seconds:6.1f}"
         f"  {'missed: ' + missed if missed else 'met'}"
     )
-
-
-def _pairs(booth: SimulatedBooth, solution: Solution) -> tuple[list[float], float]:
-    """Shifts of all pairs in mm, and the normalised squared error a number."""
-    names, truth = list(booth.rig.cameras), booth.rig.cameras
-    shifts = []
-    for i, a in enumerate(names):
-        found, _ = relatives(solution.placed, a, names[i + 1 :])
-        for b, a_from_b in zip(names[i + 1 :], found, strict=True):
-            true = invert(truth[a].world_from_camera) @ truth[b].world_from_camera
-            shifts.append(1e3 * float(np.linalg.norm(twist_between(a_from_b, true)[3:])))
-    others = [name for name in names if name != _REFERENCE]
-    found, covariance = relatives(solution.placed, _REFERENCE, others)
-    away = np.concatenate(
-        [
-            twist_between(
-                pose, invert(truth[_REFERENCE].world_from_camera) @ truth[b].world_from_camera
-            )
-            for b, pose in zip(others, found, strict=True)
-        ]
-    )
-    return shifts, float(away @ np.linalg.solve(covariance, away)) / len(away)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -7,31 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_calibration as synthetic
+from calibrated_booths import FRONT, REFERENCE, reference_errors, solved
 from scan_distortion import distortion
 
 from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Observations
 from station.calibration.solve import solution as solution_module
-from station.calibration.solve.solution import Solution, solve
-from station.calibration.solve.world import relatives
+from station.calibration.solve.solution import Solution
 from station.core.errors import CalibrationError
-from station.core.geometry import invert, transform, twist_between
+from station.core.geometry import invert, transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import Rig
-from station.simulation import violations
 from station.simulation.procedure import VirtualProcedure
 from station.simulation.scene import load_mesh
 
 BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 RATE_HZ = 9.0
 """Detections a second: enough for the sensors' fields, and quickly solved."""
-REFERENCE, FRONT = "front-upper", ("front-upper", "front-lower")
-
-
-def solved(rig: Rig, seen: Observations, radius_m: float = 0.1, **changes: object) -> Solution:
-    options: dict[str, object] = {"reference": REFERENCE, "front_cameras": FRONT, **changes}
-    cameras = synthetic.factory(rig)
-    created = "2026-01-01T00:00:00Z"
-    return solve(seen, cameras, radius_m=radius_m, created=created, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -51,22 +42,10 @@ def solution(procedure: VirtualProcedure, seen: Observations) -> Solution:
     return solved(procedure.booth.rig, seen)
 
 
-def errors(rig: Rig, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-    """Twists (18,) of three cameras relative to the reference, and their covariance."""
-    others = [name for name in rig.cameras if name != REFERENCE]
-    found, covariance = relatives(solution.placed, REFERENCE, others)
-    base = invert(rig.cameras[REFERENCE].world_from_camera)
-    twists = [
-        twist_between(pose, base @ rig.cameras[name].world_from_camera)
-        for name, pose in zip(others, found, strict=True)
-    ]
-    return np.concatenate(twists), covariance
-
-
 def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     procedure: VirtualProcedure, solution: Solution
 ) -> None:
-    twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
+    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
     assert np.degrees(np.linalg.norm(twists[:, :3], axis=1)).max() < 0.1
     found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
@@ -77,34 +56,6 @@ def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     predicted = solution.rig.predicted
     assert predicted is not None
     assert abs(found.height_mm) < 3e3 * predicted.height_sigma_m
-
-
-@pytest.mark.parametrize(
-    "switch", [violations.BIAS, violations.K1, violations.LENS, violations.OVAL]
-)
-def test_errors_of_another_form_are_found(switch: str) -> None:
-    """Rings, bumps or a distorted lens once passed for a polynomial: girths were off by 12 mm."""
-    procedure = VirtualProcedure(synthetic.booth(121, switches=(switch,)))
-    seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
-    solution = solved(procedure.booth.rig, seen)
-    found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
-    assert found.normal_rms_mm < 0.6
-    assert abs(found.height_mm) < 2.5
-    assert np.abs(found.girths_mm).max() < 5.0
-
-
-def test_what_it_says_of_its_own_errors_is_true() -> None:
-    """Noise that entered both sides of an equation once biased the depth scale by 4 sigma."""
-    total, unknowns = 0.0, 0
-    for seed in (111, 112, 113, 114):
-        procedure = VirtualProcedure(synthetic.booth(seed), waving_s=40.0)
-        rig = procedure.booth.rig
-        seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
-        away, covariance = errors(rig, solved(rig, seen))
-        total += float(away @ np.linalg.solve(covariance, away))
-        unknowns += len(away)
-    # 72 unknowns: 99.9 % lie between 0.55 and 1.6 a piece.
-    assert 0.55 < total / unknowns < 1.6
 
 
 def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None:
@@ -223,7 +174,7 @@ def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observ
         for ball in seen.balls
     ]
     solution = solved(procedure.booth.rig, replace(seen, balls=heads))
-    twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
+    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
 
 
@@ -240,7 +191,7 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure
     ]
     assert len(heads) == 100
     solution = solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
-    twists = errors(procedure.booth.rig, solution)[0].reshape(-1, 6)
+    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
 
 
@@ -290,7 +241,7 @@ def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
         return replace(ball, center_m=ball.center_m + away, patches=patches)
 
     found = solved(procedure.booth.rig, replace(seen, balls=[head(ball) for ball in seen.balls]))
-    twists = errors(procedure.booth.rig, found)[0].reshape(-1, 6)
+    twists = reference_errors(procedure.booth.rig, found.placed)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
 
 
@@ -306,6 +257,5 @@ def test_a_sensor_far_off_its_factory_scale_is_believed(monkeypatch: pytest.Monk
     procedure = VirtualProcedure(synthetic.booth(130))
     rig = procedure.booth.rig
     seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
-    twists_of = solved(rig, seen)
-    twists = errors(rig, twists_of)[0].reshape(-1, 6)
+    twists = reference_errors(rig, solved(rig, seen).placed)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2e-3
