@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 from station.calibration.detect.board import Board
 from station.calibration.guide.calibrate_cli import calibrate
 from station.calibration.guide.operator import Guide
+from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import BoothError, CalibrationError
@@ -99,6 +100,18 @@ def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationSto
     refused = _run(config, "depth")
     assert "the empty booth has to be recorded first" in str(refused.exception)
     assert "board" not in refused.output
+
+
+def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    laid: list[tuple[str, str]] = []
+    monkeypatch.setattr(Procedure, "_lay", lambda _, step, where, __="": laid.append((step, where)))
+    done = _run(config, "stand", "--height", "1.7")
+    assert done.exit_code == 0, done.output
+    assert laid == [("stand-1700", "on a stand on the mark, its underside 1.7 m above the floor")]
+    in_cm = _run(config, "stand", "--height", "170")
+    assert in_cm.exit_code == 2
+    assert "0.3<=x<=2.2" in in_cm.output
+    assert len(laid) == 1
 
 
 def test_a_step_reads_its_own_configuration(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from station.calibration.adjust.equations import recentred
 from station.calibration.adjust.problem import Problem, Sightings, State
 from station.calibration.solve.pairwise import Track
 from station.core.geometry import transform
+from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import PredictedError
 
 Array = NDArray[np.float64]
@@ -26,8 +27,6 @@ LARGEST_RMS_M = 0.006
 """Largest rms of single detections, whose own noise is 1-2 mm."""
 LARGEST_MEAN_M = 0.0025
 """Largest mean of a camera's held-out detections, in which the noise averages out."""
-_A_SECOND = 10.0
-"""Detections of a held-out second, which share the errors of one region."""
 _MIN_DETECTIONS = 6
 """Fewer comparisons prove nothing."""
 
@@ -112,8 +111,9 @@ def inflated(predicted: PredictedError, found: Mapping[str, HeldOut]) -> Predict
 
 
 def _independent(one: HeldOut) -> float:
-    """Number of held-out detections that err independently, one a second at most."""
-    return max(1.0, one.detections / _A_SECOND)
+    """Number of held-out detections that err independently: those of a second share the errors of
+    one region."""
+    return max(1.0, one.detections / (INDEPENDENT_HZ * _BLOCK_S))
 
 
 def _start(problem: Problem) -> float:

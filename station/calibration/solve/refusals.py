@@ -163,7 +163,14 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         )
 
 
-def check_predicted(predicted: PredictedError, limits: Limits, covered: Coverage) -> None:
+def remedy(stood: bool) -> str:
+    """Advice against uncertain heights; ``stood``: the ball was on a stand already."""
+    return "wave the ball longer" if stood else f"{STAND_WORDS}, and wave the ball longer"
+
+
+def check_predicted(
+    predicted: PredictedError, limits: Limits, covered: Coverage, stood: bool
+) -> None:
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
     for what, sigma_m, limit_m in (
         ("heights", predicted.height_sigma_m, limits.height_m),
@@ -175,7 +182,7 @@ def check_predicted(predicted: PredictedError, limits: Limits, covered: Coverage
                 f"by this calibration {what} could be wrong by "
                 f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, and "
                 f"{1e3 * limit_m:.0f} mm are allowed (calibrate.{what[:-1]}_limit_m): "
-                f"{STAND_WORDS}, and wave the ball longer{more}"
+                f"{remedy(stood)}{more}"
             )
 
 

@@ -188,11 +188,12 @@ def _solve(
     refusals.check_mark(placed, radius_m)
     rig = _rig(problem, placed, state, created, acceptance.overall_rms(found))
     predicted = acceptance.inflated(predict(problem, state, placed, rig.cameras), found)
-    refusals.check_predicted(predicted, limits, covered)
+    stood = bool(problem.heights_m)
+    refusals.check_predicted(predicted, limits, covered, stood)
     rig = replace(rig, predicted=predicted)
     weak = [] if covered.enough else [covered.advice()]
     if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
-        weak.append(f"for heights, {refusals.STAND_WORDS}")
+        weak.append(f"for heights, {refusals.remedy(stood)}")
     if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
         weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
     return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)

@@ -1,0 +1,92 @@
+"""What a calibration says of its own errors: widened, refused, and carried to the measurements."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from station.calibration.detect.coverage import Coverage
+from station.calibration.solve.acceptance import HeldOut, inflated
+from station.calibration.solve.refusals import STAND_WORDS, Limits, check_predicted
+from station.core.errors import CalibrationError
+from station.core.kinect_v1 import INDEPENDENT_HZ
+from station.core.rig import PredictedError
+from station.simulation.scene import default_rig
+from workers.export.stopwatch import Stopwatch
+from workers.measure.intervals import ScanErrors
+from workers.reconstruct import job
+
+SAID = PredictedError(1e-3, 1.5e-3, 0.5e-3, 2e-4)
+RMS_M, SECONDS = 2e-3, 16
+
+
+def _held_out(mean_m: float) -> HeldOut:
+    return HeldOut(int(SECONDS * INDEPENDENT_HZ), RMS_M, np.array([mean_m, 0.0, 0.0]))
+
+
+def test_offsets_within_their_own_noise_widen_nothing() -> None:
+    noise_m = RMS_M / np.sqrt(SECONDS)
+    assert inflated(SAID, {"a": _held_out(0.99 * noise_m), "b": _held_out(0.0)}) == SAID
+
+
+def test_offsets_beyond_their_noise_widen_what_is_said() -> None:
+    found = inflated(SAID, {name: _held_out(2e-3) for name in "ab"})
+    unknown_m2 = (2e-3**2 - RMS_M**2 / SECONDS) / 6.0
+    factor = np.sqrt(1.0 + unknown_m2 / SAID.normal_rms_m**2)
+    assert factor > 1.5
+    assert found.height_sigma_m == pytest.approx(factor * SAID.height_sigma_m)
+    assert found.girth_sigma_m == pytest.approx(factor * SAID.girth_sigma_m)
+    assert found.normal_rms_m == pytest.approx(factor * SAID.normal_rms_m)
+    assert found.tilt_sigma_rad == SAID.tilt_sigma_rad
+
+
+def _nothing_seen() -> Coverage:
+    return Coverage(default_rig().cameras, "front-upper")
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        (Limits(height_m=1.9e-3), "heights could be wrong by 2.0 mm, and 2 mm are allowed"),
+        (Limits(girth_m=2.9e-3), "girths could be wrong by 2.9 mm, and 3 mm are allowed"),
+    ],
+)
+def test_what_could_spoil_sizes_is_refused(limits: Limits, words: str) -> None:
+    check_predicted(SAID, Limits(), _nothing_seen(), stood=False)
+    with pytest.raises(CalibrationError) as raised:
+        check_predicted(SAID, limits, _nothing_seen(), stood=False)
+    assert words in str(raised.value)
+    assert STAND_WORDS in str(raised.value)
+
+
+def test_whoever_used_a_stand_is_not_told_to() -> None:
+    with pytest.raises(CalibrationError) as raised:
+        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), stood=True)
+    assert "stand" not in str(raised.value).replace("understand", "")
+    assert "wave the ball longer" in str(raised.value)
+
+
+@pytest.mark.parametrize("predicted", [None, SAID])
+def test_a_job_tells_the_measurements(
+    monkeypatch: pytest.MonkeyPatch, predicted: PredictedError | None
+) -> None:
+    told: list[ScanErrors] = []
+
+    def measure(*arguments: Any) -> str:
+        told.append(arguments[-1])
+        return "measured"
+
+    monkeypatch.setattr(job, "measure_body", measure)
+    monkeypatch.setattr(job, "measure_standing", measure)
+    monkeypatch.setattr(job, "patch_sigma_m", lambda *_: None)
+    surface = SimpleNamespace(sigma_m=np.zeros(3), seen=np.ones(3, bool))
+    fit = SimpleNamespace(
+        surface=surface, crown_sigma_m=3e-3, patches=(), vertices=np.zeros((3, 3)), state=None
+    )
+    job._measured(cast(Any, None), cast(Any, fit), predicted, Stopwatch())
+    sizes = (0.0, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
+    assert [(one.height_sigma_m, one.girth_sigma_m) for one in told] == [sizes, sizes]
+    assert {one.crown_sigma_m for one in told} == {3e-3}
