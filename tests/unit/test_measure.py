@@ -39,6 +39,7 @@ from workers.reconstruct.measure_cli import measure
 from workers.scape.fit.verdict import Verdict
 from workers.scape.learn.landmarks import find_landmarks
 from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.deformation import vertex_normals
 
 VERDICT = Verdict("rescan", ("the left arm is hidden",), (), ("hand_left", "forearm_left"))
 
@@ -247,6 +248,22 @@ def test_what_a_scan_says_of_itself_widens_the_rows_it_concerns(model: BodyModel
     assert doubtful["height"][1] - doubtful["height"][0] > 0.031
     assert doubtful["knee_height"] == usual["knee_height"]
     assert doubtful["waist_girth"][1] > usual["waist_girth"][1] + 0.0005
+
+
+def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) -> None:
+    """A girth of a metre that is 2 pi mm too long: the skin is 1 mm outside."""
+    sigma, seen = np.full(model.vertex_count, 3e-4), np.ones(model.vertex_count, bool)
+    said = ScanErrors(girth_sigma_m=2.0 * np.pi * 1e-3)
+    usual, doubtful = (
+        measure_body(model, model.mean, sigma, seen, errors) for errors in (ScanErrors(), said)
+    )
+    thicker = model.mean + 1e-3 * vertex_normals(model.mean, model.faces)
+    moved = measure_body(model, thicker)
+    for name in ("volume_m3", "surface_m2"):
+        before, after = getattr(usual, name), getattr(doubtful, name)
+        half = [0.5 * (one.interval95[1] - one.interval95[0]) for one in (before, after)]
+        added = np.sqrt(half[1] ** 2 - half[0] ** 2) / 1.96
+        assert added == pytest.approx(getattr(moved, name).value - before.value, rel=0.35), name
 
 
 def test_an_interval_holds_its_value() -> None:

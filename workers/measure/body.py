@@ -135,11 +135,14 @@ def _measured(
     )
     volume = signed_volume(vertices, model.faces)
     surface = float(triangle_areas(vertices, model.faces).sum())
+    further = scan_errors.of_contents(volume, surface, float(np.ptp(vertices[:, 2])))
     return MeasuredBody(
         pose,
         rows,
-        Content(volume, content_interval("volume", volume, vertex_sigma_m, pose)),
-        Content(surface, content_interval("surface", surface, vertex_sigma_m, pose)),
+        Content(volume, content_interval("volume", volume, vertex_sigma_m, pose, further.volume)),
+        Content(
+            surface, content_interval("surface", surface, vertex_sigma_m, pose, further.surface)
+        ),
     )
 
 

@@ -77,6 +77,14 @@ class ErrorModel:
 
 
 @dataclass(frozen=True, slots=True)
+class Contents:
+    """Standard deviations of a body's contents, as shares of them."""
+
+    volume: float
+    surface: float
+
+
+@dataclass(frozen=True, slots=True)
 class ScanErrors:
     """Standard deviations that concern a whole scan, metres."""
 
@@ -89,6 +97,19 @@ class ScanErrors:
     patch_sigma_m: Array | None = None
     """(P,): the surface beside patches of the scan that it does not explain. An error that is seen,
     so that no learned gain applies to it; None for none."""
+
+    def of_contents(self, volume_m3: float, surface_m2: float, height_m: float) -> Contents:
+        """Standard deviations of volume and surface, as shares of them.
+
+        A girth is off by 2 pi times what the skin is moved by, and a skin that moves by d changes
+        the volume V by S d; a cylinder's surface S by S^2 d / 2 V. Heights stretch both.
+        """
+        moved_m = self.girth_sigma_m / (2.0 * np.pi)
+        stretched = self.height_sigma_m / height_m
+        thicker = surface_m2 * moved_m / volume_m3
+        return Contents(
+            float(np.hypot(thicker, stretched)), float(np.hypot(0.5 * thicker, stretched))
+        )
 
     def of(self, definition: Definition) -> float:
         """Standard deviation of a row."""
@@ -262,12 +283,16 @@ def _model_of(trace: Trace, pose: Pose) -> ErrorModel:
 
 
 def content_interval(
-    name: str, value: float, vertex_sigma_m: Array | None, pose: Pose
+    name: str, value: float, vertex_sigma_m: Array | None, pose: Pose, further: float = 0.0
 ) -> tuple[float, float]:
-    """95 % interval of a volume or a surface, whose error is a share of the value."""
+    """95 % interval of a volume or a surface, whose error is a share of the value.
+
+    Args:
+        further: standard deviation that concerns the whole scan, a share of the value.
+    """
     if vertex_sigma_m is None:
         return value, value
-    low, high = shipped()[pose][name].interval(1.0, content_sigma(vertex_sigma_m))
+    low, high = shipped()[pose][name].interval(1.0, content_sigma(vertex_sigma_m), further)
     return value * low, value * high
 
 
