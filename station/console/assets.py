@@ -17,7 +17,7 @@ _SMALLEST_PACKED = 500
 """Bytes; below, packing saves no packet."""
 _LEVEL = 5
 _PIECE_BYTES = 32 << 10
-"""What is kept at once for a reader that reads nothing."""
+"""Most that is kept for a reader that reads nothing."""
 _TYPES = {".js": "text/javascript", ".svg": "image/svg+xml"}
 
 

@@ -70,7 +70,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Fitness:
-    """How well the waved detections agree with a state."""
+    """Agreement of the waved detections with a state."""
 
     deviations: Mapping[str, Array]
     scale: float
