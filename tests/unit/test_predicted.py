@@ -1,4 +1,4 @@
-"""What a calibration says of its own errors: widened, refused, and carried to the measurements."""
+"""Errors that a calibration states of itself: widened, refused, and carried to the measurements."""
 
 from __future__ import annotations
 
