@@ -11,14 +11,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.geometry import so3_exp
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
+    NARROWEST_TILTS_RAD,
+    PROTRUSION_SHARE,
     Definition,
     Drop,
-    Foremost,
     Level,
+    Narrowest,
     Perpendicular,
     Plane,
+    Protrusion,
     Route,
     Section,
     Top,
@@ -30,7 +34,7 @@ Array = NDArray[np.float64]
 _DIRECTIONS = 720
 _STEP_M = 2.5e-4
 _SAME_POINT_M = 1e-6
-_BELOW, _ABOVE = 0.10, 0.45
+_BELOW = 0.10
 
 
 class TrueBody:
@@ -65,19 +69,15 @@ class TrueBody:
         return self._section(row, kind)
 
     def _section(self, row: Definition, kind: Section) -> float:
+        if isinstance(kind.plane, Narrowest):
+            return min(self._neck(kind.plane, kind.parts, tilt) for tilt in NARROWEST_TILTS_RAD)
         point, normal = self._plane(kind.plane)
         segments = self._segments(point, normal, kind.parts)
         if not kind.whole:
             segments = _nearest_chain(segments, point)
         points = segments.reshape(-1, 3)
         if kind.across is None:
-            helper = np.eye(3)[np.argmin(np.abs(normal))]
-            x = np.cross(normal, helper)
-            x /= np.linalg.norm(x)
-            y = np.cross(normal, x)
-            angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
-            reach = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
-            return float(np.pi * np.ptp(reach, axis=0).mean())
+            return _tape_around(points, normal)
         side, other = kind.across
         across = self._at[other] - self._at[side]
         across = across - normal * (normal @ across)
@@ -85,6 +85,16 @@ class TrueBody:
         if row.quantity == "depth":
             across = np.cross(normal, across)
         return float(np.ptp(points @ across))
+
+    def _neck(self, plane: Narrowest, parts: tuple[str, ...], tilt: float) -> float:
+        at = self._at
+        side = at[plane.other_side] - at[plane.side]
+        side /= np.sqrt(side @ side)
+        upright = np.array([0.0, 0.0, 1.0]) - side[2] * side
+        normal = so3_exp(tilt * side) @ (upright / np.sqrt(upright @ upright))
+        chains = _chains(self._segments(at[plane.at], normal, parts))
+        largest = max(chains, key=len)
+        return _tape_around(largest.reshape(-1, 3), normal)
 
     def _plane(self, plane: Plane) -> tuple[Array, Array]:
         at = self._at
@@ -94,15 +104,19 @@ class TrueBody:
                 end = sum(at[name] for name in plane.towards) / len(plane.towards)
                 start = (1.0 - plane.share) * start + plane.share * end
             return start, np.array([0.0, 0.0, 1.0])
-        if isinstance(plane, Foremost):
+        if isinstance(plane, Protrusion):
             heights = [float(self._plane(level)[0][2]) for level in (plane.lower, plane.upper)]
-            ahead = (at[plane.front] - at[plane.back]) * (1.0, 1.0, 0.0)
-            best = max(
-                (float(place @ ahead), tuple(place))
+            ahead = (at[plane.end] - at[plane.start]) * (1.0, 1.0, 0.0)
+            ahead /= np.sqrt(ahead @ ahead)
+            places = [
+                place
                 for place, part in zip(self._v, self._part, strict=True)
                 if part in plane.parts and heights[0] <= place[2] <= heights[1]
-            )
-            return np.array(best[1]), np.array([0.0, 0.0, 1.0])
+            ]
+            most = max(float(place @ ahead) for place in places)
+            softness = PROTRUSION_SHARE * (heights[1] - heights[0])
+            shares = [np.exp((float(place @ ahead) - most) / softness) for place in places]
+            return np.average(places, axis=0, weights=shares), np.array([0.0, 0.0, 1.0])
         if isinstance(plane, Perpendicular):
             line = at[plane.end] - at[plane.start]
             share = plane.share
@@ -142,26 +156,28 @@ class TrueBody:
             elif leg == "straight":
                 total += float(np.linalg.norm(self._at[names[index + 1]] - self._at[names[index]]))
             else:
-                total += self._over(names[index], names[index + 1], kind.parts, leg == "tape")
+                total += self._over(kind, names[index], names[index + 1], leg == "tape")
         return total
 
-    def _over(self, start: str, end: str, parts: tuple[str, ...], taut: bool) -> float:
+    def _over(self, kind: Route, start: str, end: str, taut: bool) -> float:
         a, b = self._at[start], self._at[end]
         outward = self._normal(start) + self._normal(end)
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
         up = outward - along * (along @ outward)
         up /= np.linalg.norm(up)
-        segments = self._segments(a, np.cross(along, up), parts)
+        segments = self._segments(a, np.cross(along, up), kind.parts)
         x, y = (segments - a) @ along, (segments - a) @ up
-        grid = np.arange(0.0, length, _STEP_M)
+        mine = ((y > -_BELOW * length) & (y < kind.bulge * length)).all(axis=1)
+        x, y = x[mine], y[mine]
+        corners = x[(x > 0.0) & (x < length)]
+        grid = np.unique(np.concatenate([np.arange(0.0, length, _STEP_M), corners]))
         envelope = np.full(len(grid), -np.inf)
         for (x0, x1), (y0, y1) in zip(x, y, strict=True):
             if x1 < x0:
                 x0, x1, y0, y1 = x1, x0, y1, y0
-            inside = slice(*np.searchsorted(grid, (x0, x1)))
+            inside = slice(np.searchsorted(grid, x0), np.searchsorted(grid, x1, side="right"))
             heights = np.interp(grid[inside], (x0, x1), (y0, y1))
-            heights[(heights <= -_BELOW * length) | (heights >= _ABOVE * length)] = -np.inf
             envelope[inside] = np.maximum(envelope[inside], heights)
         seen = np.isfinite(envelope)
         line = np.stack([grid[seen], envelope[seen]], axis=1)
@@ -182,19 +198,43 @@ class TrueBody:
         return np.asarray(total / np.sqrt(total @ total))
 
 
+def _tape_around(points: Array, normal: Array) -> float:
+    """Length of a tape around points (n, 3) of a plane section."""
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    x = np.cross(normal, helper)
+    x /= np.linalg.norm(x)
+    y = np.cross(normal, x)
+    angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    reach = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
+    return float(np.pi * np.ptp(reach, axis=0).mean())
+
+
 def _nearest_chain(segments: Array, point: Array) -> Array:
     """The segments that hang together with the one nearest to a point."""
+
+    def away(chain: Array) -> float:
+        return float(np.linalg.norm(chain.mean(axis=1) - point, axis=1).min())
+
+    return min(_chains(segments), key=away)
+
+
+def _chains(segments: Array) -> list[Array]:
+    """Segments (n, 2, 3), those that hang together."""
     keys = np.round(segments / _SAME_POINT_M).astype(np.int64)
     ends: dict[tuple[int, ...], list[int]] = {}
     for index, pair in enumerate(keys):
         for key in pair:
             ends.setdefault(tuple(key.tolist()), []).append(index)
-    start = int(np.argmin(np.linalg.norm(segments.mean(axis=1) - point, axis=1)))
-    reached, open_ends = {start}, [start]
-    while open_ends:
-        for key in keys[open_ends.pop()]:
-            for neighbour in ends[tuple(key.tolist())]:
-                if neighbour not in reached:
-                    reached.add(neighbour)
-                    open_ends.append(neighbour)
-    return segments[sorted(reached)]
+    left, chains = set(range(len(segments))), []
+    while left:
+        start = left.pop()
+        reached, open_ends = {start}, [start]
+        while open_ends:
+            for key in keys[open_ends.pop()]:
+                for neighbour in ends[tuple(key.tolist())]:
+                    if neighbour not in reached:
+                        reached.add(neighbour)
+                        open_ends.append(neighbour)
+        left -= reached
+        chains.append(segments[sorted(reached)])
+    return chains

@@ -37,7 +37,7 @@ from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
 from workers.reconstruct.measure_cli import measure
 from workers.scape.fit.verdict import Verdict
-from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.learn.landmarks import landmarks
 from workers.scape.model.body_model import BodyModel, BodyState, load_model
 from workers.scape.model.deformation import vertex_normals
 
@@ -82,9 +82,8 @@ def test_every_row_has_a_plain_name() -> None:
     assert {sides_pooled(definition.name) for definition in DEFINITIONS} == set(TERMS)
 
 
-def test_the_model_carries_the_landmarks_that_the_rules_find(model: BodyModel) -> None:
-    found = find_landmarks(model.mean, list(model.part_names), model.part_of_vertex.astype(np.intp))
-    assert found == model.landmarks
+def test_the_model_carries_the_landmarks_of_the_template(model: BodyModel) -> None:
+    assert landmarks(model.symmetry) == model.landmarks
 
 
 def test_landmarks_lie_where_surveys_find_them(model: BodyModel) -> None:

@@ -74,9 +74,10 @@ def test_a_tape_around_nothing_is_refused(points: np.ndarray) -> None:
 def test_a_tape_over_a_sphere() -> None:
     ball = sphere((0.0, 0.0, 0.0), 0.1)
     start, end = np.array([-0.06, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])
-    found, _ = EdgeNet.build(ball.faces).cut(ball.vertices, start, np.array([0.0, 1.0, 0.0]))
+    net = EdgeNet.build(ball.faces)
+    found, crossing = net.cut(ball.vertices, start, np.array([0.0, 1.0, 0.0]))
     points = found.on(ball.vertices)
-    order = surface_order(points, start, end, UP, taut=True)
+    order = surface_order(points, net.segments(crossing), (start, end), UP, taut=True, bulge=0.45)
     path = np.concatenate([start[None], points[order], end[None]])
     assert loop_length(path, closed=False) == pytest.approx(0.1 * 2 * np.arcsin(0.6), rel=0.02)
 
@@ -85,10 +86,30 @@ def test_skin_follows_a_hollow_that_a_tape_spans() -> None:
     x = np.linspace(0.01, 0.29, 60)
     points = np.stack([x, 0 * x, 0.012 * np.cos(2 * np.pi * x / 0.15)], axis=1)
     ends = np.array([0.0, 0.0, 0.012]), np.array([0.3, 0.0, 0.012])
-    tape = surface_order(points, *ends, UP, taut=True)
-    skin = surface_order(points, *ends, UP, taut=False)
+    links = np.arange(59), np.arange(1, 60)
+    tape = surface_order(points, links, ends, UP, taut=True, bulge=0.45)
+    skin = surface_order(points, links, ends, UP, taut=False, bulge=0.45)
     assert len(skin) == 60
     assert len(tape) < 3
+
+
+def test_skin_that_folds_back_is_followed_on_its_outside() -> None:
+    """A roll of skin hangs over the next: the line passes outside and never goes back."""
+    x = np.array([0.05, 0.15, 0.14, 0.10, 0.11, 0.20, 0.25])
+    y = np.array([0.01, 0.03, 0.02, 0.01, 0.00, 0.01, 0.00])
+    points = np.stack([x, 0 * x, y], axis=1)
+    links = np.arange(6), np.arange(1, 7)
+    ends = np.zeros(3), np.array([0.3, 0.0, 0.0])
+    skin = surface_order(points, links, ends, UP, taut=False, bulge=0.45)
+    assert skin.tolist() == [0, 1, 5, 6]
+
+
+def test_skin_that_bulges_too_far_is_another_part() -> None:
+    points = np.array([[0.1, 0.0, 0.01], [0.15, 0.0, 0.05], [0.2, 0.0, 0.01]])
+    links = np.arange(2), np.arange(1, 3)
+    ends = np.zeros(3), np.array([0.3, 0.0, 0.0])
+    assert len(surface_order(points, links, ends, UP, taut=True, bulge=0.45)) == 1
+    assert len(surface_order(points, links, ends, UP, taut=True, bulge=0.12)) == 2
 
 
 def test_a_point_on_an_edge_goes_with_the_mesh() -> None:

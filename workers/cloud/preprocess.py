@@ -142,13 +142,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     part = np.ascontiguousarray(depth[window])
     edge = jumps(part)
     typical = float(np.median(part[near[window]]))
-    smooth: Image = cv2.bilateralFilter(
-        part,
-        _BILATERAL_DIAMETER_PX,
-        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical))),
-        _BILATERAL_SPACE_PX,
-    )  # type: ignore[assignment]  # the type of what it is given
-    smooth[part == 0] = 0.0
+    smooth = filtered(part, typical)
     depth[window] = np.where(smooth > 0, smooth, part)
     points = rays(calibration)[window] * smooth[..., None]
     directions, valid = normals(points, smooth)
@@ -174,6 +168,21 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         frames=len(bundle.frames[name]),
         ordered=_ordered(bundle, name),
     )
+
+
+def filtered(depth_m: Image, typical_m: float) -> Image:
+    """Bilateral filter (Tomasi & Manduchi 1998) of averaged readings; missing ones stay 0.
+
+    Args:
+        typical_m: distance of the person, which sets the noise.
+    """
+    smooth = cv2.bilateralFilter(
+        depth_m,
+        _BILATERAL_DIAMETER_PX,
+        _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical_m))),
+        _BILATERAL_SPACE_PX,
+    )
+    return np.where(depth_m > 0, smooth, np.float32(0.0)).astype(np.float32)
 
 
 def _ordered(bundle: Bundle, name: str) -> int:

@@ -9,24 +9,29 @@ from __future__ import annotations
 from workers.measure.kinds import (
     Definition,
     Drop,
-    Foremost,
     Level,
+    Narrowest,
+    Protrusion,
     Route,
     Section,
     Tilted,
     Top,
 )
 from workers.measure.limbs import arm, bodice, hand, leg, shoulder
-from workers.measure.vocabulary import BODY, CLOTHES, HIPS, SHOULDERS, TRUNK, YOKE, distance
+from workers.measure.vocabulary import BODY, CLOTHES, COLLAR, HIPS, SHOULDERS, TRUNK, YOKE, distance
 
 _BUST = ("bust_left", "bust_right")
 _UNDERBUST = ("underbust_left", "underbust_right")
 _WAIST = ("waist_front", "waist_back", "waist_side_left", "waist_side_right")
 _BUTTOCKS = ("buttock_left", "buttock_right")
 _ARMPITS = ("armpit_left", "armpit_right")
-_BELLY = Foremost(
-    Level(_WAIST, _UNDERBUST, 0.5), Level(_BUTTOCKS), "waist_front", "waist_back",
+_BELLY = Protrusion(
+    Level(_WAIST, _UNDERBUST, 0.5), Level(_BUTTOCKS), "waist_back", "waist_front",
     ("pelvis", "abdomen"),
+)  # fmt: skip
+_SEAT = Protrusion(
+    Level(_WAIST, _BUTTOCKS, 0.5), Level(("crotch",)), "waist_front", "waist_back",
+    ("pelvis", "thigh_left", "thigh_right"),
 )  # fmt: skip
 
 
@@ -65,8 +70,8 @@ def _head_and_neck() -> tuple[Definition, ...]:
         Definition(
             "neck_girth", "just below the larynx, perpendicular to the neck", "girth",
             Section(
-                Tilted("neck_front", "neck_back", *_both("side_neck")),
-                ("neck", "head", "chest"),
+                Narrowest("neck_front", *_both("side_neck")),
+                ("head", *SHOULDERS),
             ),
             f"{CLOTHES} 5.3.2",
         ),
@@ -76,7 +81,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
             "girth",
             Route(
                 ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-                ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True,
+                ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.12,
             ),
             f"{CLOTHES} 5.3.3",
         ),
@@ -116,7 +121,7 @@ def _trunk_girths() -> tuple[Definition, ...]:
             "large girth",
             Route(
                 ("side_neck_right", "bust_right", "waist_front", "crotch", "waist_back"),
-                ("tape", "tape", "tape", "tape", "tape"), (*TRUNK, *SHOULDERS), closed=True,
+                ("tape", "tape", "tape", "tape", "tape"), (*TRUNK, "neck", *COLLAR), closed=True,
             ),
             CLOTHES,
         ),
@@ -126,13 +131,13 @@ def _trunk_girths() -> tuple[Definition, ...]:
         ),
         Definition(
             "hip_girth", "level, where the buttocks protrude farthest", "large girth",
-            Section(Level(_BUTTOCKS), HIPS, whole=True), f"{CLOTHES} 5.3.13",
+            Section(_SEAT, HIPS, whole=True), f"{CLOTHES} 5.3.13",
         ),
     )  # fmt: skip
 
 
 def _trunk_breadths() -> tuple[Definition, ...]:
-    chest, waist, hips = Level(_BUST), Level(_WAIST), Level(_BUTTOCKS)
+    chest, waist = Level(_BUST), Level(_WAIST)
     return (
         Definition(
             "chest_breadth", "at the bust points, from side to side", "breadth",
@@ -152,11 +157,11 @@ def _trunk_breadths() -> tuple[Definition, ...]:
         ),
         Definition(
             "hip_breadth", "where the buttocks protrude farthest, from side to side", "breadth",
-            Section(hips, HIPS, whole=True, across=_both("hip_side")), BODY,
+            Section(_SEAT, HIPS, whole=True, across=_both("hip_side")), BODY,
         ),
         Definition(
             "hip_depth", "where the buttocks protrude farthest, from front to back", "depth",
-            Section(hips, HIPS, whole=True, across=_both("hip_side")),
+            Section(_SEAT, HIPS, whole=True, across=_both("hip_side")),
         ),
     )  # fmt: skip
 

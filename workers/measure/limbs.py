@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from workers.measure.kinds import Definition, Drop, Level, Perpendicular, Route, Section
-from workers.measure.vocabulary import BODY, CLOTHES, FLANK, SHOULDERS, TRUNK, YOKE, distance
+from workers.measure.vocabulary import (
+    BODY,
+    CLOTHES,
+    COLLAR,
+    FLANK,
+    SHOULDERS,
+    TRUNK,
+    YOKE,
+    distance,
+)
 
 
 def arm(side: str) -> tuple[Definition, ...]:
@@ -102,14 +111,15 @@ def bodice(side: str) -> tuple[Definition, ...]:
             "side of the neck over the bust point to the front of the waist", "length",
             Route(
                 (f"side_neck_{side}", f"bust_{side}", "waist_front"), ("tape", "tape"),
-                (*TRUNK, *SHOULDERS),
+                (*TRUNK, "neck", *COLLAR),
             ),
             CLOTHES,
         ),
         Definition(
             f"neck_shoulder_to_waist_back_{side}",
             "side of the neck to the back of the waist", "length",
-            Route((f"side_neck_{side}", "waist_back"), ("tape",), (*TRUNK, *SHOULDERS)), CLOTHES,
+            Route((f"side_neck_{side}", "waist_back"), ("tape",), (*TRUNK, "neck", *COLLAR)),
+            CLOTHES,
         ),
         Definition(
             f"neck_to_bust_length_{side}", "side of the neck to the bust point", "length",

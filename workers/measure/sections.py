@@ -83,20 +83,20 @@ class EdgeNet:
         return found, crossing
 
     def pieces(self, crossing: Index) -> Index:
-        """The connected piece of a section that each cut edge belongs to.
-
-        A cut triangle has two cut edges: it joins them.
-        """
+        """The connected piece of a section that each cut edge belongs to."""
         count = len(crossing)
+        tails, heads = self.segments(crossing)
+        links = coo_matrix((np.ones(len(tails)), (tails, heads)), shape=(count, count))
+        return np.asarray(connected_components(links, directed=False)[1], np.intp)
+
+    def segments(self, crossing: Index) -> tuple[Index, Index]:
+        """Pairs of cut edges, by their place in `crossing`, that one triangle joins."""
         triangle = np.concatenate([self.left[crossing], self.right[crossing]])
-        cut_edge = np.tile(np.arange(count), 2)
+        cut_edge = np.tile(np.arange(len(crossing)), 2)
         order = np.argsort(triangle, kind="stable")
         triangle, cut_edge = triangle[order], cut_edge[order]
         same = np.flatnonzero(triangle[1:] == triangle[:-1])
-        links = coo_matrix(
-            (np.ones(len(same)), (cut_edge[same], cut_edge[same + 1])), shape=(count, count)
-        )
-        return np.asarray(connected_components(links, directed=False)[1], np.intp)
+        return cut_edge[same], cut_edge[same + 1]
 
 
 def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]:
@@ -154,30 +154,51 @@ def loop_length(points: Array, *, closed: bool) -> float:
     return float(np.linalg.norm(steps, axis=1).sum())
 
 
-BELOW_CHORD, ABOVE_CHORD = 0.10, 0.45
-"""Points farther from the straight line than these shares of its length are another part of the
+_BELOW_CHORD = 0.10
+"""Points farther below the straight line than this share of its length are another part of the
 body."""
+_OUTSIDE = 1e-6
+"""Share of the length that a point of the outside may lie below the highest segment there."""
 
 
-def surface_order(points: Array, start: Array, end: Array, outward: Array, *, taut: bool) -> Index:
-    """Indices, in order, of the points (n, 3) of a section on its outside from start to end.
+def surface_order(
+    points: Array,
+    segments: tuple[Index, Index],
+    ends: tuple[Array, Array],
+    outward: Array,
+    *,
+    taut: bool,
+    bulge: float,
+) -> Index:
+    """Indices, in order, of the points (n, 3) of a section on its outside between two ends.
 
     The section is that of the plane of both ends and of `outward`. A taut tape skips hollows.
+
+    Args:
+        segments: the points that follow each other in the section.
+        bulge: height above the straight line, as a share of its length, from which points are
+            another part of the body.
     """
+    start, end = ends
     along = end - start
     length = float(np.linalg.norm(along))
     along = along / length
     up = outward - along * (outward @ along)
     up = up / np.linalg.norm(up)
     x, y = (points - start) @ along, (points - start) @ up
-    order = np.flatnonzero(
-        (x > 0.0) & (x < length) & (y > -BELOW_CHORD * length) & (y < ABOVE_CHORD * length)
-    )
+    near = (y > -_BELOW_CHORD * length) & (y < bulge * length)
+    order = np.flatnonzero(near & (x > 0.0) & (x < length))
     order = order[np.argsort(x[order], kind="stable")]
-    if not taut:
-        return order
-    u, v = np.r_[0.0, x[order], length], np.r_[0.0, y[order], 0.0]
-    return np.asarray(order[_taut(u, v)[1:-1] - 1], np.intp)
+    if taut:
+        u, v = np.r_[0.0, x[order], length], np.r_[0.0, y[order], 0.0]
+        return np.asarray(order[_taut(u, v)[1:-1] - 1], np.intp)
+    a, b = (index[near[segments[0]] & near[segments[1]]] for index in segments)
+    a, b = np.where(x[a] <= x[b], a, b), np.where(x[a] <= x[b], b, a)
+    here = x[order][:, None]
+    share = (here - x[a]) / np.maximum(x[b] - x[a], 1e-12)
+    height = np.where((here > x[a]) & (here < x[b]), y[a] + share * (y[b] - y[a]), -np.inf)
+    highest = height.max(axis=1, initial=-np.inf)
+    return np.asarray(order[y[order] >= highest - _OUTSIDE * length], np.intp)
 
 
 @numba.njit(cache=True)

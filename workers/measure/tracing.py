@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
+    NARROWEST_TILTS_RAD,
+    PROTRUSION_SHARE,
     Definition,
     Drop,
-    Foremost,
     Level,
+    Narrowest,
     Perpendicular,
     Plane,
+    Protrusion,
     Route,
     Section,
     Tilted,
@@ -79,12 +82,23 @@ def _net(model: BodyModel, parts: tuple[str, ...]) -> EdgeNet:
     return EdgeNet.build(model.faces[inside[model.faces].all(axis=1)])
 
 
+@dataclass(frozen=True, slots=True)
+class _Tape:
+    """Tape around a section."""
+
+    points: EdgePoints
+    places: Array
+    """(n, 3)."""
+    normal: Array
+    """Of the section's plane."""
+
+
 class _Tracer:
     def __init__(self, model: BodyModel, vertices: Array) -> None:
         self._model = model
         self._vertices = vertices
         self._normals = vertex_normals(vertices, model.faces)
-        self._cuts: dict[Section, tuple[EdgePoints, Array]] = {}
+        self._cuts: dict[Section, _Tape] = {}
 
     def trace(self, definition: Definition) -> Trace:
         try:
@@ -145,48 +159,70 @@ class _Tracer:
                     self._at(other) - self._at(side), self._at(back) - self._at(front)
                 )
                 return self._at(front), normal / np.linalg.norm(normal)
-            case Foremost(upper, lower, front, back, parts):
-                return self._foremost(
-                    self._plane(upper)[0][2], self._plane(lower)[0][2],
-                    self._at(front) - self._at(back), parts,
-                ), _UP  # fmt: skip
+            case Protrusion():
+                return self._farthest(plane), _UP
 
-    def _foremost(self, high: float, low: float, ahead: Array, parts: tuple[str, ...]) -> Array:
-        """Vertex of some parts that is farthest ahead among those between two heights."""
-        names = [self._model.part_names.index(part) for part in parts]
+    def _farthest(self, plane: Protrusion) -> Array:
+        """Weighted mean of the vertices that protrude most."""
+        high, low = (self._plane(level)[0][2] for level in (plane.upper, plane.lower))
+        names = [self._model.part_names.index(part) for part in plane.parts]
         height = self._vertices[:, 2]
         inside = np.isin(self._model.part_of_vertex, names) & (low <= height) & (height <= high)
         candidates = self._vertices[inside]
         if not len(candidates):
             raise ValueError("no vertex lies between the two levels")
-        return np.asarray(candidates[np.argmax(candidates[:, :2] @ ahead[:2])])
+        direction = (self._at(plane.end) - self._at(plane.start))[:2]
+        reach = candidates[:, :2] @ (direction / np.linalg.norm(direction))
+        weight = np.exp((reach - reach.max()) / (PROTRUSION_SHARE * (high - low)))
+        return np.asarray(weight @ candidates / weight.sum())
 
-    def _cut(self, section: Section) -> tuple[EdgePoints, Array]:
-        """Points of the tape around a section and their positions; kept for breadth and depth."""
+    def _narrowest(self, section: Section, plane: Narrowest) -> _Tape:
+        across = self._at(plane.other_side) - self._at(plane.side)
+        ahead = np.cross(across, _UP)
+        ahead /= np.linalg.norm(ahead)
+        up = np.cross(ahead, across)
+        up /= np.linalg.norm(up)
+        tapes = (
+            self._tape(section, self._at(plane.at), np.cos(tilt) * up + np.sin(tilt) * ahead)
+            for tilt in NARROWEST_TILTS_RAD
+        )
+        return min(tapes, key=lambda tape: loop_length(tape.places, closed=True))
+
+    def _cut(self, section: Section) -> _Tape:
+        """Tape around a section; kept for breadth and depth."""
         key = Section(section.plane, section.parts, section.whole)
         if key not in self._cuts:
-            point, normal = self._plane(section.plane)
-            net = _net(self._model, section.parts)
-            found, crossing = net.cut(self._vertices, point, normal)
-            places = found.on(self._vertices)
-            if not section.whole and len(places):
-                piece = net.pieces(crossing)
-                nearest = np.argmin(np.linalg.norm(places - point, axis=1))
-                chosen = np.flatnonzero(piece == piece[nearest])
-                found, places = found.take(chosen), places[chosen]
-            tape = hull_order(places, normal)
-            self._cuts[key] = found.take(tape), places[tape]
+            if isinstance(section.plane, Narrowest):
+                self._cuts[key] = self._narrowest(section, section.plane)
+            else:
+                self._cuts[key] = self._tape(section, *self._plane(section.plane))
         return self._cuts[key]
 
+    def _tape(self, section: Section, point: Array, normal: Array) -> _Tape:
+        net = _net(self._model, section.parts)
+        found, crossing = net.cut(self._vertices, point, normal)
+        places = found.on(self._vertices)
+        if not section.whole and len(places):
+            piece = net.pieces(crossing)
+            if isinstance(section.plane, Narrowest):
+                # A low plane may cut the larynx off, nearer to the landmark than the neck is.
+                wanted = np.argmax(np.bincount(piece))
+            else:
+                wanted = piece[np.argmin(np.linalg.norm(places - point, axis=1))]
+            chosen = np.flatnonzero(piece == wanted)
+            found, places = found.take(chosen), places[chosen]
+        tape = hull_order(places, normal)
+        return _Tape(found.take(tape), places[tape], normal)
+
     def _section(self, definition: Definition, section: Section) -> tuple[float, EdgePoints, bool]:
-        points, places = self._cut(section)
+        tape = self._cut(section)
         if section.across is None:
-            return loop_length(places, closed=True), points, True
+            return loop_length(tape.places, closed=True), tape.points, True
         side, other = section.across
-        breadth, depth = plane_axes(self._plane(section.plane)[1], self._at(other) - self._at(side))
-        reach = places @ (breadth if definition.quantity == "breadth" else depth)
+        breadth, depth = plane_axes(tape.normal, self._at(other) - self._at(side))
+        reach = tape.places @ (breadth if definition.quantity == "breadth" else depth)
         low, high = int(np.argmin(reach)), int(np.argmax(reach))
-        ends = points.take(np.array([low, high]))
+        ends = tape.points.take(np.array([low, high]))
         return float(reach[high] - reach[low]), ends, False
 
     def _route(self, route: Route) -> EdgePoints:
@@ -195,17 +231,25 @@ class _Tracer:
         ends = marks[1:] + (marks[:1] if route.closed else [])
         for start, end, leg in zip(marks, ends, route.legs, strict=False):
             if leg != "straight":
-                pieces.append(self._over_skin(route.parts, start, end, taut=leg == "tape"))
+                pieces.append(self._over_skin(route, start, end, taut=leg == "tape"))
             pieces.append(EdgePoints.at([end]))
         if route.closed:
             pieces.pop()
         return EdgePoints.joined(pieces)
 
-    def _over_skin(self, parts: tuple[str, ...], start: int, end: int, *, taut: bool) -> EdgePoints:
+    def _over_skin(self, route: Route, start: int, end: int, *, taut: bool) -> EdgePoints:
         ends = self._vertices[start], self._vertices[end]
         outward = self._normals[start] + self._normals[end]
         normal = np.cross(ends[1] - ends[0], outward)
         normal /= np.linalg.norm(normal)
-        found, _ = _net(self._model, parts).cut(self._vertices, ends[0], normal)
-        order: Index = surface_order(found.on(self._vertices), *ends, outward, taut=taut)
+        net = _net(self._model, route.parts)
+        found, crossing = net.cut(self._vertices, ends[0], normal)
+        order: Index = surface_order(
+            found.on(self._vertices),
+            net.segments(crossing),
+            ends,
+            outward,
+            taut=taut,
+            bulge=route.bulge,
+        )
         return found.take(order)

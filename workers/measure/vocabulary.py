@@ -12,9 +12,9 @@ from workers.measure.kinds import Definition, Leg, Route
 
 TRUNK = ("pelvis", "abdomen", "chest")
 HIPS = (*TRUNK, "thigh_left", "thigh_right")
-SHOULDERS = (
-    "neck", "chest", "shoulder_left", "shoulder_right", "upper_arm_left", "upper_arm_right",
-)  # fmt: skip
+COLLAR = ("shoulder_left", "shoulder_right")
+"""Parts between the neck and the arms, without upper arms, which may be raised above them."""
+SHOULDERS = ("neck", "chest", *COLLAR, "upper_arm_left", "upper_arm_right")
 YOKE = tuple(part for part in SHOULDERS if part != "neck")
 """Parts below the seventh neck vertebra, without a neck that may lean to one side."""
 FLANK = (*HIPS, "shin_left", "shin_right")

@@ -30,9 +30,9 @@ ELSEWHERE_M = 0.15
 """Distance of a patch from which it is no limb of the person but something else."""
 _SHARE_OF_PATCH = 0.2
 """A patch is of every part that is nearest to at least so much of it."""
-_MIN_WIDENED_M2 = 0.0005
-"""Area from which a patch is more than a few stray readings: sound scans of the model's own family
-leave 2 cm^2 at most."""
+_MIN_WIDENED_M2 = 0.0012
+"""Area from which a patch is more than stray readings and folds: sound scans of the model's own
+family leave 2 cm^2 at most, those of other people 11."""
 _WIDENED_RINGS = 3
 """Rings of vertices around those next to a patch, whose points are thinned."""
 

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from station.core.errors import BoothError
 from station.core.geometry import so3_exp
-from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.learn.landmarks import landmarks
 from workers.scape.learn.people.shapes import Shapes, ordinary, random_shapes
 from workers.scape.learn.people.survey import STATURE, WAIST, drawn
 from workers.scape.learn.people.tailoring import Tailor
@@ -232,7 +232,6 @@ class BodyDatabase:
         mean = 0.5 * (mean + mean[self.symmetry] * (-1.0, 1.0, 1.0))
         mean -= (0.0, 0.0, mean[:, 2].min())
         names, twists = tuple(PARTS), 3 * (len(PARTS) - 1)
-        owner = np.argmax(self.part_weights, axis=1)
         return BodyModel(
             name="template",
             sha256="",
@@ -245,7 +244,7 @@ class BodyDatabase:
             mean=mean,
             directions=np.zeros((0, len(mean), 3), np.float32),
             pose_fields=np.zeros((twists, len(mean), 3), np.float32),
-            landmarks=find_landmarks(mean, list(names), owner),
+            landmarks=landmarks(self.symmetry),
             symmetry=self.symmetry,
             vertex_sigma_m=np.zeros(len(mean)),
             twist_mean=np.zeros(twists),

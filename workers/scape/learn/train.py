@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workers.scape.learn.database import PARTS, BodyDatabase, Shapes, body_database
-from workers.scape.learn.landmarks import find_landmarks
+from workers.scape.learn.landmarks import landmarks
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.learn.skin import separated
 from workers.scape.model.body_model import BodyModel, load_model, save_model
@@ -91,7 +91,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     metadata: dict[str, Any] = {
         "name": "booth-scape",
         "parts": names,
-        "landmarks": find_landmarks(mean, names, np.argmax(database.part_weights, axis=1)),
+        "landmarks": landmarks(symmetry),
         "training": {
             "bodies": plan.bodies,
             "poses": plan.poses,
