@@ -1,4 +1,4 @@
-"""What is left of small features after averaging and filtering: noses, collar bones, navels, knees.
+"""Error of small features after averaging and filtering: noses, collar bones, navels, knees.
 
     python tests/bench/bench_detail.py               # 12 held-out bodies, plain and sculpted
     python tests/bench/bench_detail.py --bodies 2    # a quick look

@@ -90,7 +90,7 @@ class _Tape:
     places: Array
     """(n, 3)."""
     normal: Array
-    """Of the section's plane."""
+    """Unit normal of the section's plane."""
 
 
 class _Tracer:
