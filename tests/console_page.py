@@ -22,7 +22,8 @@ from playwright.sync_api import (
 
 LONG_MS = 120_000
 """Patience with a machine that does much else; no test is about speed."""
-_LAUNCHES = 3
+_PAUSES_S = (1.0, 5.0, 10.0, 20.0)
+"""Pauses between attempts to start chromium."""
 _SIZE = {"width": 1024, "height": 768}
 _ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -40,10 +41,12 @@ _MOVING = """async () => {
 
 
 def _launched(playwright: Playwright, chromium: str) -> Browser:
-    """A running chromium; on a busy machine it sometimes dies by itself (SIGTRAP) at its start."""
-    for _ in range(_LAUNCHES - 1):
+    """A running chromium; beside other tests it sometimes dies by itself (SIGTRAP) at its start,
+    more than once in a row."""
+    for pause_s in _PAUSES_S:
         with suppress(Error):
             return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
+        time.sleep(pause_s)
     return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
 
 

@@ -1,5 +1,6 @@
 """Measures a true body for the benchmark, sharing with the product's measuring only the written
-definitions: the table of rows, the landmarks' vertices, the parts' names.
+definitions: the table of rows with its planes' shares, tilts and limits, the landmarks' vertices,
+the parts' names.
 
 Everything is done another way. A plane cuts whole triangles into segments; a tape around them is
 as long as the mean of the section's widths over all directions times pi (Cauchy's formula for
@@ -70,7 +71,8 @@ class TrueBody:
 
     def _section(self, row: Definition, kind: Section) -> float:
         if isinstance(kind.plane, Narrowest):
-            return min(self._neck(kind.plane, kind.parts, tilt) for tilt in NARROWEST_TILTS_RAD)
+            girths = [self._neck(kind.plane, kind.parts, tilt) for tilt in NARROWEST_TILTS_RAD]
+            return min(girth for girth in girths if girth is not None)
         point, normal = self._plane(kind.plane)
         segments = self._segments(point, normal, kind.parts)
         if not kind.whole:
@@ -86,15 +88,18 @@ class TrueBody:
             across = np.cross(normal, across)
         return float(np.ptp(points @ across))
 
-    def _neck(self, plane: Narrowest, parts: tuple[str, ...], tilt: float) -> float:
+    def _neck(self, plane: Narrowest, parts: tuple[str, ...], tilt: float) -> float | None:
         at = self._at
         side = at[plane.other_side] - at[plane.side]
         side /= np.sqrt(side @ side)
         upright = np.array([0.0, 0.0, 1.0]) - side[2] * side
         normal = so3_exp(tilt * side) @ (upright / np.sqrt(upright @ upright))
-        chains = _chains(self._segments(at[plane.at], normal, parts))
-        largest = max(chains, key=len)
-        return _tape_around(largest.reshape(-1, 3), normal)
+        middle = (at[plane.front] + at[plane.back])[None] / 2.0
+        for chain in _chains(self._segments(at[plane.front], normal, parts)):
+            reach, inner = (_reach(points, normal) for points in (chain.reshape(-1, 3), middle))
+            if (inner <= reach.max(axis=0)).all() and (inner >= reach.min(axis=0)).all():
+                return float(np.pi * np.ptp(reach, axis=0).mean())
+        return None
 
     def _plane(self, plane: Plane) -> tuple[Array, Array]:
         at = self._at
@@ -200,13 +205,18 @@ class TrueBody:
 
 def _tape_around(points: Array, normal: Array) -> float:
     """Length of a tape around points (n, 3) of a plane section."""
+    return float(np.pi * np.ptp(_reach(points, normal), axis=0).mean())
+
+
+def _reach(points: Array, normal: Array) -> Array:
+    """Coordinate of points (n, 3) along each direction of a plane, (n, directions)."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     x = np.cross(normal, helper)
     x /= np.linalg.norm(x)
     y = np.cross(normal, x)
     angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
-    reach = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
-    return float(np.pi * np.ptp(reach, axis=0).mean())
+    found = (points @ x)[:, None] * np.cos(angle) + (points @ y)[:, None] * np.sin(angle)
+    return np.asarray(found)
 
 
 def _nearest_chain(segments: Array, point: Array) -> Array:

@@ -109,6 +109,33 @@ def test_an_independent_measuring_finds_the_same(model: BodyModel, seed: int) ->
     assert measured.surface_m2.value == pytest.approx(truth["surface"], rel=1e-6)
 
 
+@pytest.mark.parametrize("lean_deg", [0.0, 20.0])
+@pytest.mark.parametrize("bow_deg", [0.0, 20.0, 40.0])
+def test_a_neck_is_as_wide_however_the_head_is_held(
+    model: BodyModel, lean_deg: float, bow_deg: float
+) -> None:
+    twists = np.zeros((model.part_count, 3))
+    for part, degrees in (("abdomen", lean_deg), ("chest", lean_deg), ("neck", bow_deg),
+                          ("head", bow_deg)):  # fmt: skip
+        twists[model.part_names.index(part), 0] = np.radians(degrees / 2.0)
+    bowed = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    upright = _values(model, model.mean)["neck_girth"]
+    assert _values(model, model.vertices(bowed))["neck_girth"] == pytest.approx(upright, abs=0.020)
+
+
+def test_hips_are_measured_where_the_seat_is(model: BodyModel) -> None:
+    """A pad of 3 cm on both buttocks, 4 cm above their farthest points, moves the level up."""
+    at = model.mean[model.landmarks["buttock_left"]] + (0.0, 0.0, 0.04)
+    away = np.linalg.norm(np.abs(model.mean) * (1, 0, 0) + model.mean * (0, 1, 1)
+                          - np.abs(at) * (1, 0, 0) - at * (0, 1, 1), axis=1)  # fmt: skip
+    padded = model.mean + 0.03 * np.exp(-((away / 0.03) ** 2))[:, None] * (0.0, 1.0, 0.0)
+    plain, moved = (
+        next(row for row in measure_body(model, body).rows if row.name == "hip_girth").path
+        for body in (model.mean, padded)
+    )
+    assert 0.01 < float(np.mean(moved[:, 2]) - np.mean(plain[:, 2])) < 0.06
+
+
 def test_left_and_right_of_the_symmetric_body_agree(model: BodyModel) -> None:
     values = _values(model, model.mean)
     for name in values:

@@ -70,7 +70,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
         Definition(
             "neck_girth", "just below the larynx, perpendicular to the neck", "girth",
             Section(
-                Narrowest("neck_front", *_both("side_neck")),
+                Narrowest("neck_front", "neck_back", *_both("side_neck")),
                 ("head", *SHOULDERS),
             ),
             f"{CLOTHES} 5.3.2",
@@ -81,7 +81,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
             "girth",
             Route(
                 ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-                ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.12,
+                ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25,
             ),
             f"{CLOTHES} 5.3.3",
         ),

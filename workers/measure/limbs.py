@@ -123,7 +123,8 @@ def bodice(side: str) -> tuple[Definition, ...]:
         ),
         Definition(
             f"neck_to_bust_length_{side}", "side of the neck to the bust point", "length",
-            Route((f"side_neck_{side}", f"bust_{side}"), ("tape",), SHOULDERS), CLOTHES,
+            Route((f"side_neck_{side}", f"bust_{side}"), ("tape",), ("neck", "chest", *COLLAR)),
+            CLOTHES,
         ),
     )  # fmt: skip
 

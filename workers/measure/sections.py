@@ -122,6 +122,13 @@ def hull_order(points: Array, normal: Array) -> Index:
     return np.asarray(tape, np.intp)
 
 
+def encloses(hull: Array, normal: Array, point: Array) -> bool:
+    """Whether a convex polygon (n, 3), seen along its plane's normal, holds a point."""
+    sides = np.roll(hull, -1, axis=0) - hull
+    turns = np.cross(sides, point - hull) @ normal
+    return bool((turns >= 0.0).all() or (turns <= 0.0).all())
+
+
 @numba.njit(cache=True)
 def _chain(u, v, order):  # type: ignore[no-untyped-def]  # pragma: no cover
     """The convex hull of points (n,), sorted by u and then v, counter-clockwise: the chain below

@@ -30,6 +30,7 @@ from workers.measure.sections import (
     EdgeNet,
     EdgePoints,
     Index,
+    encloses,
     hull_order,
     loop_length,
     plane_axes,
@@ -42,6 +43,8 @@ Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
 """Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
+_MIN_LOOP = 8
+"""Points of a section from which a piece may be a loop of skin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +167,8 @@ class _Tracer:
 
     def _farthest(self, plane: Protrusion) -> Array:
         """Weighted mean of the vertices that protrude most."""
-        high, low = (self._plane(level)[0][2] for level in (plane.upper, plane.lower))
+        levels = (self._plane(level)[0][2] for level in (plane.lower, plane.upper))
+        low, high = sorted(levels)
         names = [self._model.part_names.index(part) for part in plane.parts]
         height = self._vertices[:, 2]
         inside = np.isin(self._model.part_of_vertex, names) & (low <= height) & (height <= high)
@@ -182,10 +186,21 @@ class _Tracer:
         ahead /= np.linalg.norm(ahead)
         up = np.cross(ahead, across)
         up /= np.linalg.norm(up)
-        tapes = (
-            self._tape(section, self._at(plane.at), np.cos(tilt) * up + np.sin(tilt) * ahead)
-            for tilt in NARROWEST_TILTS_RAD
-        )
+        middle = 0.5 * (self._at(plane.front) + self._at(plane.back))
+        net = _net(self._model, section.parts)
+        tapes = []
+        for tilt in NARROWEST_TILTS_RAD:
+            normal = np.cos(tilt) * up + np.sin(tilt) * ahead
+            found, crossing = net.cut(self._vertices, self._at(plane.front), normal)
+            places, piece = found.on(self._vertices), net.pieces(crossing)
+            for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
+                if len(chosen) < _MIN_LOOP:
+                    continue
+                tape = chosen[hull_order(places[chosen], normal)]
+                if encloses(places[tape], normal, middle):
+                    tapes.append(_Tape(found.take(tape), places[tape], normal))
+        if not tapes:
+            raise ValueError("no section goes around it")
         return min(tapes, key=lambda tape: loop_length(tape.places, closed=True))
 
     def _cut(self, section: Section) -> _Tape:
@@ -204,11 +219,7 @@ class _Tracer:
         places = found.on(self._vertices)
         if not section.whole and len(places):
             piece = net.pieces(crossing)
-            if isinstance(section.plane, Narrowest):
-                # A low plane may cut the larynx off, nearer to the landmark than the neck is.
-                wanted = np.argmax(np.bincount(piece))
-            else:
-                wanted = piece[np.argmin(np.linalg.norm(places - point, axis=1))]
+            wanted = piece[np.argmin(np.linalg.norm(places - point, axis=1))]
             chosen = np.flatnonzero(piece == wanted)
             found, places = found.take(chosen), places[chosen]
         tape = hull_order(places, normal)

@@ -3,7 +3,8 @@
 A landmark is a vertex of the template, the same in every model: what is learned from other bodies
 moves the mean body and leaves the definitions of the rows alone. They were placed on a symmetric
 mean body in the neutral pose, by its geometry and, where skin alone does not show where a bone
-ends, by the shares of the stature of large surveys (ANSUR II, men and women averaged).
+ends, by the shares of the stature of large surveys (ANSUR II, men and women averaged). The shares
+below are those of the day they were placed; other mean bodies differ by up to 2 % of the stature.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _MIDDLE = {
     "cervicale": 666,  # seventh neck vertebra
     "suprasternale": 1079,  # pit of the neck, where the breast's slope turns up into the throat
     "neck_front": 600,  # below the larynx, where the neck is narrowest
-    "neck_back": 664,  # square to the neck, which leans forwards by 19 degrees
+    "neck_back": 664,  # behind it, perpendicular to the neck
     "crotch": 3889,  # lowest point of the trunk
     "waist_front": 3671,  # midway from the lowest rib to the hip bone: 0.628 of the stature
     "waist_back": 3547,
