@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.equations import ball_rows, center_equations, recentred
+from station.calibration.adjust.equations import ball_rows, center_equations, corrected_centers
 from station.calibration.adjust.problem import Sightings
 from station.calibration.adjust.sensor_model import COARSE, image_place
 from station.calibration.detect.ball_image import ball_inverse_depth
@@ -187,7 +187,7 @@ def _ball(
     )
     sightings = Sightings.of(believed, [seen])
     nothing = np.zeros(COARSE.size)
-    detected = recentred(sightings, believed, COARSE, nothing, stated)
+    detected = corrected_centers(sightings, believed, COARSE, nothing, stated)
     rows = ball_rows(sightings, believed, COARSE, detected, nothing, stated)
     matrix, _ = center_equations(sightings, rows)
     return replace(

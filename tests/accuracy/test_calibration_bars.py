@@ -63,7 +63,7 @@ def test_what_it_says_of_its_own_errors_is_true() -> None:
         procedure = VirtualProcedure(synthetic.booth(seed), waving_s=40.0)
         rig = procedure.booth.rig
         seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
-        total += normalised_square(rig, solved(rig, seen).placed)
+        total += normalised_square(rig, solved(rig, seen).world_poses)
         unknowns += 6 * (len(rig.cameras) - 1)
     # 72 unknowns: 99.9 % lie between 0.55 and 1.6 a piece.
     assert 0.55 < total / unknowns < 1.6

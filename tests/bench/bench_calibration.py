@@ -79,12 +79,12 @@ def judged(procedure: VirtualProcedure, observations: Observations) -> Row | str
     with tempfile.TemporaryDirectory() as folder:
         cylinder_mm = _cylinder(booth, solution.rig, Path(folder) / "cylinder")
         body_mm, body_true_mm = _body(booth, solution.rig, Path(folder) / "body")
-    twists = pair_errors(booth.rig, solution.placed)
+    twists = pair_errors(booth.rig, solution.world_poses)
     return Row(
         booth.seed,
         1e3 * np.linalg.norm(twists[:, 3:], axis=1),
         np.degrees(np.linalg.norm(twists[:, :3], axis=1)),
-        normalised_square(booth.rig, solution.placed),
+        normalised_square(booth.rig, solution.world_poses),
         6 * (len(booth.rig.cameras) - 1),
         cylinder_mm,
         body_mm,

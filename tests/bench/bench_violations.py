@@ -66,9 +66,9 @@ def judge(name: str, seed: int, images: bool) -> str:
     except CalibrationError as refusal:
         return f"{name:<20}{seed:>4}  refused: {refusal}"
     seconds = time.process_time() - start_s
-    shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.placed)[:, 3:], axis=1)
+    shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.world_poses)[:, 3:], axis=1)
     unknowns = 6 * (len(booth.rig.cameras) - 1)
-    chi2 = normalised_square(booth.rig, solution.placed) / unknowns
+    chi2 = normalised_square(booth.rig, solution.world_poses) / unknowns
     found: Distortion = distortion(booth, solution.rig, load_mesh(_BODY))
     predicted = solution.rig.predicted
     assert predicted is not None

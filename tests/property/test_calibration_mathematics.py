@@ -4,12 +4,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from station.calibration.adjust.equations import ROUNDNESS, TREMOR_M, Balls
+from station.calibration.adjust.equations import ROUNDNESS, TREMOR_M, BallEquations
 from station.calibration.adjust.sensor_model import BALL, FIELD, FULL, LENS, POLYNOMIAL
-from station.calibration.adjust.trajectory import KNOT_S, TimeGrid, along
+from station.calibration.adjust.trajectory import KNOT_S, TimeGrid, path_points
 from station.calibration.detect.ball_image import ball_inverse_depth
-from station.calibration.solve.pairwise import Track, relate
-from station.calibration.solve.world import Placed, relatives
+from station.calibration.solve.pairwise import Track, estimate_pair
+from station.calibration.solve.world import WorldPoses, relative_poses
 from station.core.geometry import invert, se3_exp, transform, twist_between
 from station.core.lens import pixel_rays
 from station.simulation.scene import default_rig
@@ -40,8 +40,8 @@ def test_nuisance_of_a_detection_widens_its_covariance_and_moves_nothing(seed: i
     rng = np.random.default_rng(seed)
     rows = rng.normal(0, 1e3, (2, 20, 4))
     matrix, gradient = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, 4))
-    firm = Balls(matrix, gradient, np.zeros((2, 4, 0)), np.zeros((0, 0)), np.zeros(0))
-    loose = firm.off_center(0.1, np.ones(2))
+    firm = BallEquations(matrix, gradient, np.zeros((2, 4, 0)), np.zeros((0, 0)), np.zeros(0))
+    loose = firm.marginalised(0.1, np.ones(2))
     before, after = (np.linalg.inv(balls.matrix) for balls in (firm, loose))
     prior = np.diag([TREMOR_M**2] * 3 + [(0.1 * ROUNDNESS) ** 2])
     assert np.allclose(after, before + prior, rtol=1e-6)
@@ -100,13 +100,15 @@ def test_a_path_follows_a_motion_and_bridges_gaps(seed: int) -> None:
     controls = grid.fit(times, points, np.full(len(times), 1e6))
     ask = np.linspace(0.2, 3.8, 50)
     first, value, rate = grid.basis(ask)
-    away = np.abs(along(controls, first, value) - np.vander(ask, 3, increasing=True) @ motion)
+    away = np.abs(path_points(controls, first, value) - np.vander(ask, 3, increasing=True) @ motion)
     gap = (ask > 1.4) & (ask < 2.0)
     assert away[~gap].max() < 2e-3
     assert away[gap].max() < 1e-2
-    later = along(controls, *grid.basis(ask + 1e-5)[:2])
+    later = path_points(controls, *grid.basis(ask + 1e-5)[:2])
     assert np.allclose(
-        (later - along(controls, first, value)) / 1e-5, along(controls, first, rate), atol=1e-3
+        (later - path_points(controls, first, value)) / 1e-5,
+        path_points(controls, first, rate),
+        atol=1e-3,
     )
     assert grid.count >= 4.0 / KNOT_S - 4
 
@@ -121,7 +123,7 @@ def test_two_cameras_are_related_in_spite_of_false_detections(seed: int) -> None
     wrong = rng.random(len(times)) < 0.2
     in_b = transform(invert(a_from_b), path) + rng.normal(0, 2e-3, path.shape)
     in_b[wrong] += rng.normal(0, 0.5, (wrong.sum(), 3))
-    pair = relate(Track(times, path), Track(times, in_b))
+    pair = estimate_pair(Track(times, path), Track(times, in_b))
     assert pair is not None
     assert np.linalg.norm(twist_between(a_from_b, pair.a_from_b)[3:]) < 5e-3
     assert pair.agree[wrong].mean() < 0.2
@@ -134,8 +136,8 @@ def test_covariances_between_cameras_are_carried_by_their_geometry(seed: int) ->
     rng = np.random.default_rng(seed)
     poses = {name: se3_exp(rng.uniform(-1.5, 1.5, 6)) for name in "abc"}
     root = rng.normal(0, 1e-4, (18, 18))
-    placed = Placed(poses, root @ root.T, 0.1, 0.0)
-    found, covariance = relatives(placed, "b", ["a", "c"])
+    world_poses = WorldPoses(poses, root @ root.T, 0.1, 0.0)
+    found, covariance = relative_poses(world_poses, "b", ["a", "c"])
     columns = []
     for column in root.T:
         moved = {

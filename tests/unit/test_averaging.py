@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.calibration.adjust.averaging import averaged, likeliest
+from station.calibration.adjust.averaging import averaged_state, most_probable_widths
 from station.calibration.adjust.problem import Layout, Problem, State, priors
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import LEVELS, Widths
@@ -52,7 +52,7 @@ def state(gains: Mapping[str, float], sigma: float) -> State:
 
 
 def test_sound_units_are_believed_to_be_sound() -> None:
-    found = likeliest(problem(), state(dict.fromkeys(CAMERAS, 1e-4), 1e-4))
+    found = most_probable_widths(problem(), state(dict.fromkeys(CAMERAS, 1e-4), 1e-4))
     assert set(found.sensors.values()) == {(0,) * 5}
     assert (found.radius, found.bow) == (0, 0)
 
@@ -60,18 +60,18 @@ def test_sound_units_are_believed_to_be_sound() -> None:
 def test_units_that_are_all_wrong_get_a_wide_prior_of_that_class_alone() -> None:
     gains = dict(zip(NAMES, (3e-3, -2e-3, 4e-3, -3e-3), strict=True))
     at = state(gains, 1e-4)
-    found = likeliest(problem(), at)
+    found = most_probable_widths(problem(), at)
     for levels in found.sensors.values():
         assert levels[0] >= LEVELS - 2
         assert levels[1:] == (0,) * 4
-    solved = averaged(problem(), at)
+    solved = averaged_state(problem(), at)
     for name, gain in gains.items():
         assert solved.sensors[name][GAIN] == pytest.approx(gain, abs=1e-4)
 
 
 def test_one_wrong_unit_does_not_make_the_others_doubtful() -> None:
     gains = dict(zip(NAMES, (0.0, 5e-3, 0.0, 0.0), strict=True))
-    found = likeliest(problem(), state(gains, 1e-4))
+    found = most_probable_widths(problem(), state(gains, 1e-4))
     assert [found.sensors[name][0] for name in NAMES] == [0, LEVELS - 1, 0, 0]
 
 
@@ -81,7 +81,7 @@ def test_what_the_data_do_not_decide_shows_in_the_covariance() -> None:
     place = layout.sensor(NAMES[0])[GAIN]
     sigmas = {}
     for said, sigma in (("sound", 1e-4), ("nothing", 1.0)):
-        solved = averaged(problem(), state(dict.fromkeys(CAMERAS, 0.0), sigma))
+        solved = averaged_state(problem(), state(dict.fromkeys(CAMERAS, 0.0), sigma))
         sigmas[said] = float(np.sqrt(solved.covariance[place, place]))
     assert sigmas["sound"] < 1.5e-4
     # 0.6 of 0.03 %, the rest up to 0.4 %.
@@ -90,5 +90,5 @@ def test_what_the_data_do_not_decide_shows_in_the_covariance() -> None:
 
 def test_a_moderate_departure_gets_a_moderate_width() -> None:
     """0.12 % is four times a sound unit's, and a third of the worst."""
-    found = likeliest(problem(), state(dict.fromkeys(CAMERAS, 1.2e-3), 1e-4))
+    found = most_probable_widths(problem(), state(dict.fromkeys(CAMERAS, 1.2e-3), 1e-4))
     assert {levels[0] for levels in found.sensors.values()} <= {1, 2}

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from station.calibration.detect.board import Board, BoardView, check_ties, find_board, judge_lens
+from station.calibration.detect.board import (
+    Board,
+    BoardView,
+    check_agreement,
+    find_board,
+    judge_lens,
+)
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, rigid, se3_exp, so3_exp
 from station.core.rig import CameraCalibration
@@ -144,7 +150,7 @@ def _pair_views(board: Board) -> dict[str, list[BoardView]]:
 
 def test_two_cameras_carry_the_board_from_one_to_the_other() -> None:
     rig = default_rig()
-    report = check_ties(rig, _pair_views(BOARD), BOARD)
+    report = check_agreement(rig, _pair_views(BOARD), BOARD)
     assert report.pairs["front-lower", "front-upper"] < 0.006
     assert report.size_ratio == pytest.approx(1.0, abs=0.01)
     turned = replace(
@@ -152,7 +158,7 @@ def test_two_cameras_carry_the_board_from_one_to_the_other() -> None:
         world_from_camera=rig.cameras["front-lower"].world_from_camera
         @ se3_exp((0.0, 0.02, 0.0, 0.0, 0.0, 0.0)),
     )
-    worse = check_ties(
+    worse = check_agreement(
         replace(rig, cameras={**rig.cameras, "front-lower": turned}), _pair_views(BOARD), BOARD
     )
     assert worse.pairs["front-lower", "front-upper"] > 0.015
@@ -160,7 +166,7 @@ def test_two_cameras_carry_the_board_from_one_to_the_other() -> None:
 
 def test_a_board_of_another_square_size_is_refused() -> None:
     with pytest.raises(CalibrationError, match=r"measure 66\.\d mm .* not 60\.0 mm"):
-        check_ties(default_rig(), _pair_views(Board(7, 5, 0.066, 0.0495)), BOARD)
+        check_agreement(default_rig(), _pair_views(Board(7, 5, 0.066, 0.0495)), BOARD)
 
 
 @pytest.mark.parametrize(

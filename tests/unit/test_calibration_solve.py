@@ -45,7 +45,7 @@ def solution(procedure: VirtualProcedure, seen: Observations) -> Solution:
 def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     procedure: VirtualProcedure, solution: Solution
 ) -> None:
-    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
+    twists = reference_errors(procedure.booth.rig, solution.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
     assert np.degrees(np.linalg.norm(twists[:, :3], axis=1)).max() < 0.1
     found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
@@ -73,8 +73,8 @@ def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None
         seen, balls=boast(seen.balls), mark=boast(seen.mark), front=boast(seen.front), around=around
     )
     rig = procedure.booth.rig
-    honest, doubted = (solved(rig, observed).placed for observed in (seen, boasted))
-    sigmas = [np.sqrt(np.diag(placed.covariance)) for placed in (honest, doubted)]
+    honest, doubted = (solved(rig, observed).world_poses for observed in (seen, boasted))
+    sigmas = [np.sqrt(np.diag(world_poses.covariance)) for world_poses in (honest, doubted)]
     shares = sigmas[1] / sigmas[0]
     assert shares.max() < 1.1
     assert np.median(shares) > 0.75
@@ -86,7 +86,7 @@ def test_the_mark_is_the_origin_and_the_floor_is_zero(
     for name, camera in procedure.booth.rig.cameras.items():
         pose = solution.rig.cameras[name].world_from_camera
         assert np.linalg.norm(pose[:3, 3] - camera.world_from_camera[:3, 3]) < 6e-3
-    assert solution.placed.mark_height_m == pytest.approx(0.1, abs=2e-3)
+    assert solution.world_poses.mark_height_m == pytest.approx(0.1, abs=2e-3)
 
 
 def test_the_ball_shows_a_floor_that_no_camera_sees(
@@ -103,7 +103,7 @@ def test_the_ball_shows_a_floor_that_no_camera_sees(
         assert np.degrees(np.arccos(min(float(up @ true_up), 1.0))) < 0.1
         assert abs(ours[2, 3] - camera.world_from_camera[2, 3]) < 4e-3
     # What balls on the floor show of its slope is limited by how far it may be bowed.
-    assert solution.placed.slope_sigma_rad < np.radians(0.15)
+    assert solution.world_poses.slope_sigma_rad < np.radians(0.15)
 
 
 def test_a_slope_that_is_hardly_known_is_refused() -> None:
@@ -174,7 +174,7 @@ def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observ
         for ball in seen.balls
     ]
     solution = solved(procedure.booth.rig, replace(seen, balls=heads))
-    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
+    twists = reference_errors(procedure.booth.rig, solution.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
 
 
@@ -191,7 +191,7 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure
     ]
     assert len(heads) == 100
     solution = solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
-    twists = reference_errors(procedure.booth.rig, solution.placed)[0]
+    twists = reference_errors(procedure.booth.rig, solution.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
 
 
@@ -241,7 +241,7 @@ def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
         return replace(ball, center_m=ball.center_m + away, patches=patches)
 
     found = solved(procedure.booth.rig, replace(seen, balls=[head(ball) for ball in seen.balls]))
-    twists = reference_errors(procedure.booth.rig, found.placed)[0]
+    twists = reference_errors(procedure.booth.rig, found.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
 
 
@@ -257,5 +257,5 @@ def test_a_sensor_far_off_its_factory_scale_is_believed(monkeypatch: pytest.Monk
     procedure = VirtualProcedure(synthetic.booth(130))
     rig = procedure.booth.rig
     seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
-    twists = reference_errors(rig, solved(rig, seen).placed)[0]
+    twists = reference_errors(rig, solved(rig, seen).world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2e-3

@@ -97,7 +97,7 @@ def test_no_more_frames_are_looked_at_than_are_worth_it(
     with BallFinder(session, patient=True) as looking:
         for start_s in (500.0, 20.0):
             times = [start_s + number / 30.0 for number in range(30)]
-            looking.look(TimedFrame(_CAMERAS[0], time_s, image, 1e-3) for time_s in times)
+            looking.submit(TimedFrame(_CAMERAS[0], time_s, image, 1e-3) for time_s in times)
         looking.found(wait=True)
     assert len(looked) == 2 * INDEPENDENT_HZ
 
@@ -128,7 +128,7 @@ def test_frames_of_a_replay_that_wait_are_kept_on_disk(
         {_CAMERAS[0]: default_rig().cameras[_CAMERAS[0]]},
     )  # fmt: skip
     with BallFinder(session, patient=True) as looking:
-        looking.look(
+        looking.submit(
             Frame(_CAMERAS[0], seconds, TABLE[image], DEPTH_SCALE_M, file=file)
             for image, (seconds, _, file) in zip(raw, check_recording(recording), strict=True)
         )

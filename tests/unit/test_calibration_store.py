@@ -196,8 +196,8 @@ def test_advice_names_what_is_missing() -> None:
             coverage.add(
                 _ball(name, 0.1 * moment + (0.02 if name == "front-lower" else 0), (x, y, z))
             )
-    assert coverage.ties()["front-lower"] == ("front-upper", 400)
-    assert coverage.ties()["back-lower"][1] == 0
+    assert coverage.links()["front-lower"] == ("front-upper", 400)
+    assert coverage.links()["back-lower"][1] == 0
     enough_with_half = coverage.enough
     for moment in range(400, 800):
         for index, name in enumerate(CAMERAS):

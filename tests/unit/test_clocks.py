@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from station.calibration.solve.clocks import large_jump
-from station.calibration.solve.pairwise import Track, relate_all
+from station.calibration.solve.pairwise import Track, estimate_pairs
 
 
 def track(times_s: np.ndarray, late_s: np.ndarray | float = 0.0) -> Track:
@@ -23,7 +23,7 @@ def test_a_jump_is_found_and_its_camera_named() -> None:
     times = seen(0.0, 40.0)
     late = np.where(times > 20.0, 0.7, 0.0)
     tracks = {"a": track(times), "b": track(times + 0.02), "c": track(times, late)}
-    jump = large_jump(tracks, relate_all(tracks))
+    jump = large_jump(tracks, estimate_pairs(tracks))
     assert jump is not None
     assert jump.camera == "c"
     assert abs(jump.jump_s) == pytest.approx(0.7, abs=0.2)
@@ -35,4 +35,4 @@ def test_cameras_that_see_the_ball_in_turn_have_sound_clocks() -> None:
     first = np.concatenate([seen(0.0, 20.0), seen(24.0, 24.9), seen(28.0, 28.9)])
     second = np.concatenate([seen(0.0, 20.0), seen(24.25, 26.0), seen(28.25, 30.0)])
     tracks = {"a": track(first), "b": track(second)}
-    assert large_jump(tracks, relate_all(tracks)) is None
+    assert large_jump(tracks, estimate_pairs(tracks)) is None

@@ -51,14 +51,14 @@ _UNLIKELY = 7.0
 """Fields and choices less likely by a factor e^7 than the best do not count."""
 
 
-def likeliest(problem: Problem, state: State) -> Widths:
+def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths of the largest evidence, by the information and gradient of a state."""
     fields = _fields(problem, state)
     best = max(fields, key=lambda field: field.best[1])
     return best.widths(best.best[0])
 
 
-def averaged(problem: Problem, state: State) -> State:
+def averaged_state(problem: Problem, state: State) -> State:
     """The state moved to the mean over all widths, with the covariance over them."""
     layout = Layout.of(problem)
     fields = _fields(problem, state)

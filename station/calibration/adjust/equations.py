@@ -34,7 +34,7 @@ _HUBER = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Balls:
+class BallEquations:
     """Normal equations of (centre, radius; theta) of n detections, H (n, 4, 4) and so on.
 
     ``theta_matrix`` (U, U) and ``theta_gradient`` (U,) are summed over the detections.
@@ -47,9 +47,9 @@ class Balls:
     theta_matrix: Array
     theta_gradient: Array
 
-    def summed(self) -> Balls:
+    def summed(self) -> BallEquations:
         """All detections as one: those of a ball that rests."""
-        return Balls(
+        return BallEquations(
             self.matrix.sum(axis=0)[None],
             self.gradient.sum(axis=0)[None],
             self.mixed.sum(axis=0)[None],
@@ -57,7 +57,7 @@ class Balls:
             self.theta_gradient,
         )
 
-    def off_center(self, radius_m: float, trust: Array) -> Balls:
+    def marginalised(self, radius_m: float, trust: Array) -> BallEquations:
         """The equations once each detection has a tremor and a radius error of its own.
 
         The four nuisance parameters d with prior information L are eliminated: H becomes
@@ -69,7 +69,7 @@ class Balls:
         taken = self.matrix @ inverse
         half = np.swapaxes(np.linalg.cholesky(inverse), 1, 2) @ self.mixed
         flat = half.reshape(4 * len(half), half.shape[-1])
-        return Balls(
+        return BallEquations(
             self.matrix - taken @ self.matrix,
             self.gradient - np.einsum("nij,nj->ni", taken, self.gradient),
             self.mixed - taken @ self.mixed,
@@ -78,9 +78,9 @@ class Balls:
             - np.einsum("niu,nij,nj->u", self.mixed, inverse, self.gradient, optimize=True),
         )
 
-    def moved(self, shift: Array) -> Balls:
+    def moved(self, shift: Array) -> BallEquations:
         """The equations about centres that lie elsewhere by shifts (n, 3)."""
-        return Balls(
+        return BallEquations(
             self.matrix,
             self.gradient + np.einsum("nij,nj->ni", self.matrix[..., :3], shift),
             self.mixed,
@@ -100,7 +100,7 @@ def center_equations(seen: Sightings, rows: BallRows) -> tuple[Array, Array]:
 
 def ball_equations(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, rows: BallRows, trust: Array
-) -> Balls:
+) -> BallEquations:
     """All equations, each detection weighed by its trust (n,)."""
     weight = seen.weight * trust[:, None]
     weighted = rows.jacobian * weight[..., None]
@@ -109,7 +109,7 @@ def ball_equations(
         model, camera, rows.expected.ravel(), seen.place.reshape(-1, 2),
         rows.ray.reshape(-1, 2), rows.by_ray.reshape(-1, 2), rows.by_flattening.ravel(),
     )  # fmt: skip
-    return Balls(
+    return BallEquations(
         np.swapaxes(weighted, 1, 2) @ rows.jacobian,
         np.einsum("nki,nk->ni", weighted, rows.residual),
         *design.products(
@@ -118,7 +118,7 @@ def ball_equations(
     )
 
 
-def recentred(
+def corrected_centers(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, parameters: Array,
     radius_m: float,
 ) -> Array:  # fmt: skip
@@ -183,7 +183,7 @@ def _rows_along(
 
 
 @dataclass(frozen=True, slots=True)
-class Planes:
+class PlaneEquations:
     """Normal equations of (plane m, bow) (10) and theta (U) of one view of a surface."""
 
     matrix: Array
@@ -199,7 +199,7 @@ class Planes:
 def plane_equations(
     surface: Surface, camera: CameraCalibration, model: SensorModel, plane: Array,
     parameters: Array, bow: Array,
-) -> Planes:  # fmt: skip
+) -> PlaneEquations:  # fmt: skip
     """Equations at a plane m (3,) and a bow (7,), which only floors have."""
     ray = pixel_rays(model.camera(camera, parameters), surface.pixels)
     towards = np.column_stack([ray, np.ones(len(ray))])
@@ -224,7 +224,7 @@ def plane_equations(
     mixed, theta_matrix, theta_gradient = design.products(
         model.size, jacobian, weight, residual, len(weight)
     )
-    return Planes(
+    return PlaneEquations(
         weighted.T @ jacobian,
         weighted.T @ residual,
         mixed[0],

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from station.calibration.adjust.looks import Fitness
 from station.calibration.adjust.normal import NormalEquations
 from station.calibration.adjust.problem import Layout, Problem, State, moved_state
+from station.calibration.adjust.residuals import FitQuality
 
 _ITERATIONS = 30
 _SETTLED = 0.1
@@ -40,7 +40,7 @@ def _settle(problem: Problem, start: State, iterations: int, informed: bool) -> 
         if size < _SETTLED:
             break
     # The detections tell how noisy they are, and nothing of priors and floors.
-    fitness = Fitness.of(problem, state)
+    fitness = FitQuality.of(problem, state)
     state = replace(state, deviations=fitness.deviations, scale=fitness.scale, last_step=size)
     if informed:
         information, gradient = NormalEquations(problem, layout, state, state.scale).reduced()

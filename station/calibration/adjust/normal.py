@@ -15,14 +15,13 @@ from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_matrix
 
 from station.calibration.adjust.equations import (
-    Balls,
+    BallEquations,
     ball_equations,
     plane_equations,
 )
-from station.calibration.adjust.looks import Look
 from station.calibration.adjust.problem import (
-    BOW,
-    FOOT,
+    BOW_SIZE,
+    POSE_AND_CLOCK,
     Indices,
     Layout,
     Problem,
@@ -31,7 +30,8 @@ from station.calibration.adjust.problem import (
     Surface,
     priors,
 )
-from station.calibration.adjust.trajectory import along
+from station.calibration.adjust.residuals import DetectionResiduals
+from station.calibration.adjust.trajectory import path_points
 from station.calibration.detect.detections import FLOOR
 from station.core.geometry import skew
 from station.core.kinect_v1 import FROZEN_SHARE
@@ -111,27 +111,29 @@ class NormalEquations:
             self._border[np.ix_(prior.index, prior.index)] += prior.information
             self._gradient[prior.index] += prior.information @ prior.values
 
-    def _balls(self, seen: Sightings, look: Look, trust: Array) -> Balls:
+    def _balls(self, seen: Sightings, residuals: DetectionResiduals, trust: Array) -> BallEquations:
         problem = self._problem
-        return ball_equations(seen, problem.cameras[seen.camera], problem.model, look.rows, trust)
+        return ball_equations(
+            seen, problem.cameras[seen.camera], problem.model, residuals.rows, trust
+        )
 
     def _add_waved(self, seen: Sightings) -> None:
         if not len(seen.times_s):
             return
         state, layout, name = self._state, self._layout, seen.camera
         pose = state.poses[name]
-        look = Look.along_path(self._problem, state, seen)
-        first, value, centers = look.first, look.value, look.centers
-        trust = self._trust * look.robust
-        balls = self._balls(seen, look, trust).moved(centers - look.near)
-        balls = balls.off_center(self._problem.radius_m, trust)
+        residuals = DetectionResiduals.along_path(self._problem, state, seen)
+        first, value, centers = residuals.first, residuals.value, residuals.centers
+        trust = self._trust * residuals.robust
+        balls = self._balls(seen, residuals, trust).moved(centers - residuals.near)
+        balls = balls.marginalised(self._problem.radius_m, trust)
 
-        chain = np.zeros((len(centers), 4, FOOT + 1))
+        chain = np.zeros((len(centers), 4, POSE_AND_CLOCK + 1))
         chain[:, :3, :3] = skew(centers)
         chain[:, :3, 3:6] = -np.eye(3)
-        chain[:, :3, 6] = along(state.controls, first, look.rate) @ pose[:3, :3]
+        chain[:, :3, 6] = path_points(state.controls, first, residuals.rate) @ pose[:3, :3]
         chain[:, 3, 7] = 1.0
-        index = np.concatenate([layout.camera(name)[:FOOT], layout.radius])
+        index = np.concatenate([layout.camera(name)[:POSE_AND_CLOCK], layout.radius])
         sensor = layout.sensor(name)
         self._add_balls(balls, chain, index, sensor)
         carried = balls.matrix @ chain
@@ -158,14 +160,14 @@ class NormalEquations:
 
     def _add_resting(self, place: str, seen: Sightings) -> None:
         state, layout, name = self._state, self._layout, seen.camera
-        pose, looks = state.poses[name], len(seen.times_s)
+        pose, detections = state.poses[name], len(seen.times_s)
         center = (state.places[place] - pose[:3, 3]) @ pose[:3, :3]
-        centers = np.repeat(center[None], looks, axis=0)
-        look = Look.at_rest(self._problem, state, seen, centers)
-        # Looks at a still ball share the part of the noise that stays.
-        trust = self._trust * look.robust / (FROZEN_SHARE * looks + 1.0 - FROZEN_SHARE)
-        balls = self._balls(seen, look, trust).summed()
-        balls = balls.off_center(self._problem.radius_m, np.array([self._trust]))
+        centers = np.repeat(center[None], detections, axis=0)
+        residuals = DetectionResiduals.at_rest(self._problem, state, seen, centers)
+        # Detections of a still ball share the part of the noise that does not change.
+        trust = self._trust * residuals.robust / (FROZEN_SHARE * detections + 1.0 - FROZEN_SHARE)
+        balls = self._balls(seen, residuals, trust).summed()
+        balls = balls.marginalised(self._problem.radius_m, np.array([self._trust]))
         chain = np.zeros((1, 4, 6 + 3 + 1))
         chain[0, :3, :3], chain[0, :3, 3:6] = skew(center), -np.eye(3)
         chain[0, :3, 6:9] = pose[:3, :3].T
@@ -173,7 +175,9 @@ class NormalEquations:
         index = np.concatenate([layout.camera(name)[:6], layout.triple(place), layout.radius])
         self._add_balls(balls, chain, index, layout.sensor(name))
 
-    def _add_balls(self, balls: Balls, chain: Array, index: Indices, sensor: Indices) -> None:
+    def _add_balls(
+        self, balls: BallEquations, chain: Array, index: Indices, sensor: Indices
+    ) -> None:
         kept = index >= 0
         chain, index = chain[..., kept], index[kept]
         carried = balls.matrix @ chain
@@ -201,10 +205,10 @@ class NormalEquations:
         view = plane_equations(
             surface, problem.cameras[name], problem.model, m, state.sensors[name], state.bow
         )
-        chain = np.zeros((3 + BOW, 6 + 3 + BOW))
+        chain = np.zeros((3 + BOW_SIZE, 6 + 3 + BOW_SIZE))
         chain[:3, :3], chain[:3, 3:6] = skew(m), np.outer(m, m)
         chain[:3, 6:9] = rotation.T / (1.0 - q @ shift) + np.outer(m, shift) / (1.0 - q @ shift)
-        chain[3:, 9:] = np.eye(BOW)
+        chain[3:, 9:] = np.eye(BOW_SIZE)
         index = np.concatenate(
             [layout.camera(name)[:6], layout.triple(surface.surface), layout.bow]
         )
@@ -223,7 +227,7 @@ class NormalEquations:
         length = np.linalg.norm(q)
         height_m = problem.heights_m.get(place, 0.0)
         above = (1.0 - q @ at) / length
-        terms = problem.bow_terms.get(place, np.zeros(BOW))
+        terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))
         off_m = above - terms @ state.bow - state.radius_m - height_m
         row = np.concatenate([-q / length, -at / length - above * q / length**2, [-1.0], -terms])
         index = np.concatenate(

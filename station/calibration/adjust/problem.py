@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from station.calibration.adjust.sensor_model import FULL, SensorModel, image_place
 from station.calibration.adjust.trajectory import TimeGrid
-from station.calibration.adjust.widths import BOW as BOW_CLASS
-from station.calibration.adjust.widths import BOW_TOLERANCE, RADIUS, Widths, sigma
+from station.calibration.adjust.widths import BOW, BOW_TOLERANCE, RADIUS, Widths, sigma
 from station.calibration.detect.detections import FLOOR, BallDetection, PlaneObservation
 from station.core.geometry import se3_exp
 from station.core.lens import pixel_rays
@@ -20,9 +19,9 @@ from station.core.rig import CameraCalibration
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FOOT = 7
+POSE_AND_CLOCK = 7
 """Pose (6) and clock (1) come before a camera's sensor parameters."""
-BOW = 7
+BOW_SIZE = 7
 """Terms of the floor's bow: x^2, x y, y^2, x^3, x^2 y, x y^2, y^3 about the mark."""
 
 
@@ -141,7 +140,7 @@ class State:
     planes: Mapping[str, Array]
     """q (3,) of q . X = 1."""
     radius_m: float
-    bow: Array = field(default_factory=lambda: np.zeros(BOW))
+    bow: Array = field(default_factory=lambda: np.zeros(BOW_SIZE))
     """Coefficients (7,) of the floor's bow, metres at 1 m from the mark."""
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Information of the border's unknowns, priors included; empty unless asked for."""
@@ -171,30 +170,30 @@ class Layout:
     @classmethod
     def of(cls, problem: Problem) -> Layout:
         starts, size = {}, 0
-        per_camera = FOOT + problem.model.size
+        per_camera = POSE_AND_CLOCK + problem.model.size
         for name in problem.cameras:
             # The reference's missing pose and clock point before its start, and are left out.
-            starts[name] = size - (FOOT if name == problem.reference else 0)
-            size += per_camera - (FOOT if name == problem.reference else 0)
+            starts[name] = size - (POSE_AND_CLOCK if name == problem.reference else 0)
+            size += per_camera - (POSE_AND_CLOCK if name == problem.reference else 0)
         # A floor that no camera sees is known by the places where the ball rests on it.
         surfaces = dict.fromkeys((FLOOR, *(seen.surface for seen in problem.surfaces)))
         for name in (*problem.resting, *surfaces):
             starts[name] = size
             size += 3
         return cls(
-            starts, size + 1 + BOW, problem.reference, frozenset(problem.cameras), per_camera
+            starts, size + 1 + BOW_SIZE, problem.reference, frozenset(problem.cameras), per_camera
         )
 
     def camera(self, name: str) -> Indices:
         """Indices of pose, clock and sensor parameters; -1 where they are fixed."""
         index = np.arange(self.per_camera) + self.starts[name]
         if name == self.reference:
-            index[:FOOT] = -1
+            index[:POSE_AND_CLOCK] = -1
         return index
 
     def sensor(self, name: str) -> Indices:
         """Indices of the sensor parameters."""
-        return self.camera(name)[FOOT:]
+        return self.camera(name)[POSE_AND_CLOCK:]
 
     def triple(self, name: str) -> Indices:
         """Indices (3,) of a place or plane."""
@@ -203,12 +202,12 @@ class Layout:
     @property
     def radius(self) -> Indices:
         """Index (1,) of the ball's radius."""
-        return np.array([self.size - 1 - BOW])
+        return np.array([self.size - 1 - BOW_SIZE])
 
     @property
     def bow(self) -> Indices:
         """Indices (7,) of the floor's bow."""
-        return np.arange(self.size - BOW, self.size)
+        return np.arange(self.size - BOW_SIZE, self.size)
 
     @property
     def geometry(self) -> Indices:
@@ -249,7 +248,7 @@ def priors(problem: Problem, layout: Layout, state: State) -> Iterator[Prior]:
     radius_sigma_m = sigma(RADIUS, widths.radius) * problem.radius_m
     off_m = np.array([state.radius_m - problem.radius_m])
     yield Prior(layout.radius, np.array([[radius_sigma_m**-2.0]]), off_m)
-    bow_sigma = sigma(BOW_CLASS, widths.bow) * BOW_TOLERANCE
+    bow_sigma = sigma(BOW, widths.bow) * BOW_TOLERANCE
     yield Prior(layout.bow, np.diag(bow_sigma**-2.0), state.bow)
 
 
@@ -261,7 +260,7 @@ def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> 
         moved = name != layout.reference
         poses[name] = state.poses[name] @ se3_exp(step[index[:6]]) if moved else state.poses[name]
         clocks[name] = state.clock_s[name] + (float(step[index[6]]) if moved else 0.0)
-        sensors[name] = state.sensors[name] + step[index[FOOT:]]
+        sensors[name] = state.sensors[name] + step[index[POSE_AND_CLOCK:]]
     return replace(
         state,
         poses=poses,

@@ -71,6 +71,6 @@ class TimeGrid:
         return np.asarray(cho_solve_banded((cholesky_banded(band), False), right))
 
 
-def along(controls: Array, first: Indices, weights: Array) -> Array:
+def path_points(controls: Array, first: Indices, weights: Array) -> Array:
     """Points (n, 3) on the path of control points (count, 3), by ``TimeGrid.basis``."""
     return np.einsum("nk,nki->ni", weights, controls[first[:, None] + np.arange(4)])

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.ball_hands import hands, surroundings
+from station.calibration.detect.ball_hands import hand_pixels, surroundings
 from station.calibration.detect.ball_image import (
     INCIDENCE_COSINE,
     ball_image,
@@ -134,7 +134,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
         if round_ >= 2:
             gate = max(0.6 * gate, _GATE_SIGMAS * 1.3 * RANDOM_SIGMA)
     for _ in range(_STRAY_ROUNDS):
-        off = hands(part, camera, ray, center, radius, radius_m, gate)
+        off = hand_pixels(part, camera, ray, center, radius, radius_m, gate)
         clean = np.where(off, np.float32(0.0), part)
         for _ in range(2):
             normal, pull, used, seen = normal_equations(clean, ray, center, radius, gate, False)

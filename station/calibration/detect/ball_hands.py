@@ -28,7 +28,7 @@ _FINGERS_SHOW_M = 1.7
 """Up to this distance a finger is as wide as the averaging window that reveals strays."""
 
 
-def hands(
+def hand_pixels(
     part: Image,
     camera: CameraCalibration,
     ray: Image,

@@ -261,7 +261,7 @@ def _apart_m(one: CameraCalibration, other: CameraCalibration) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class TieReport:
+class AgreementReport:
     """Agreement of two cameras on the board's position through a calibration."""
 
     pairs: Mapping[tuple[str, str], float]
@@ -271,7 +271,9 @@ class TieReport:
     cameras see it at once."""
 
 
-def check_ties(rig: Rig, views: Mapping[str, Sequence[BoardView]], board: Board) -> TieReport:
+def check_agreement(
+    rig: Rig, views: Mapping[str, Sequence[BoardView]], board: Board
+) -> AgreementReport:
     """Compare the board as two cameras see it at the same moment, through a calibration.
 
     Raises:
@@ -295,7 +297,7 @@ def check_ties(rig: Rig, views: Mapping[str, Sequence[BoardView]], board: Board)
         steps.append(ours - theirs)
         gaps.append(np.broadcast_to(gap, ours.shape))
     if not pairs:
-        return TieReport(pairs, float("nan"))
+        return AgreementReport(pairs, float("nan"))
     step, wanted = np.concatenate(steps), np.concatenate(gaps)
     ratio = float(np.sum(step * wanted) / np.sum(step * step))
     if abs(ratio - 1.0) > _SIZE_TOLERANCE:
@@ -304,7 +306,7 @@ def check_ties(rig: Rig, views: Mapping[str, Sequence[BoardView]], board: Board)
             f"calibration, not {1e3 * board.square_m:.1f} mm: it is a board of another size, give "
             "its own with --square"
         )
-    return TieReport(pairs, ratio)
+    return AgreementReport(pairs, ratio)
 
 
 def _together(

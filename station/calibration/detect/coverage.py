@@ -59,7 +59,7 @@ class Coverage:
         """Detections of each camera."""
         return dict(self._seen)
 
-    def ties(self) -> dict[str, tuple[str, int]]:
+    def links(self) -> dict[str, tuple[str, int]]:
         """The camera that ties each to the reference, directly or not, and the number of moments.
 
         The strongest ties first (Prim's tree).
@@ -99,7 +99,7 @@ class Coverage:
                 needs += [(self._spread_m(name) / _DEPTH_SPREAD_M, self._nearer_words(name))]
                 filled = int((self._cells[name] >= _CELL_SEEN).sum())
                 needs.append((filled / _CELLS, self._where_words(name)))
-        for name, (near, count) in self.ties().items():
+        for name, (near, count) in self.links().items():
             words = f"hold it where both {name} and {near} see it ({count} of {_ENOUGH_TOGETHER})"
             needs.append((count / _ENOUGH_TOGETHER, words))
         return needs

@@ -11,7 +11,13 @@ import click
 import cv2
 import numpy as np
 
-from station.calibration.detect.board import Board, BoardView, check_ties, find_board, judge_lens
+from station.calibration.detect.board import (
+    Board,
+    BoardView,
+    check_agreement,
+    find_board,
+    judge_lens,
+)
 from station.calibration.detect.detections import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
@@ -89,7 +95,7 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
 
 
 def _list(procedure: Procedure) -> None:
-    entries, session = list(procedure.store.entries()), procedure.begun()
+    entries, session = list(procedure.store.entries()), procedure.unfinished_session()
     if not entries and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
@@ -245,7 +251,7 @@ def board(
             f"{', '.join(session.cameras)}"
         )
     if procedure.store.in_use.exists():
-        ties = check_ties(Rig.load(procedure.store.in_use), views, printed)
+        ties = check_agreement(Rig.load(procedure.store.in_use), views, printed)
         for (one, other), off_m in ties.pairs.items():
             procedure.guide.say(
                 f"{one} and {other} see the board's corners {1e3 * off_m:.1f} mm apart "

@@ -43,7 +43,7 @@ class BallFinder:
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def look(self, frames: Iterable[TimedFrame]) -> None:
+    def submit(self, frames: Iterable[TimedFrame]) -> None:
         """Take frames to look at: of each camera so many a second as are worth it."""
         for frame in frames:
             due_s = self._due_s.get(frame.camera, frame.time_s)

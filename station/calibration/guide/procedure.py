@@ -42,7 +42,7 @@ class Procedure:
     """DIR/<step>/<camera> in place of the live cameras."""
     guide: Guide
 
-    def begun(self) -> Session | None:
+    def unfinished_session(self) -> Session | None:
         """The calibration that is being done, if one is."""
         folder = self.store.unfinished
         return Session.load(folder) if (folder / SESSION).exists() else None
@@ -53,7 +53,7 @@ class Procedure:
         Raises:
             CalibrationError: there is none.
         """
-        session = self.begun()
+        session = self.unfinished_session()
         if session is None:
             last = self.store.newest()
             raise CalibrationError(
@@ -65,7 +65,7 @@ class Procedure:
 
     def run(self) -> None:
         """All steps that are not done yet."""
-        session = self.begun()
+        session = self.unfinished_session()
         if session is not None:
             self.guide.say(f"going on with the calibration that was begun {session.started}")
             self.guide.say(f"  kept: {session.summary()}; a step is done anew by its own command")
@@ -116,7 +116,7 @@ class Procedure:
 
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
-        session = self.begun()
+        session = self.unfinished_session()
         before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MAX_PLACES):
             step = f"{AROUND}-{place}"
@@ -153,7 +153,7 @@ class Procedure:
     def walls(self, asked: bool) -> None:
         """The flat board at as many places as the operator (or the recordings) likes."""
         # Live, a further board is added to those that were seen; recordings have their own places.
-        session = self.begun()
+        session = self.unfinished_session()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
         before = session.wall_count if session and self.recordings is None else 0
@@ -220,7 +220,7 @@ class Procedure:
             source = replayed_feed(self.config, self.recordings / step)
         with source as feed:
             cameras = feed.cameras(_SENSORS_S)
-            session = self.begun()
+            session = self.unfinished_session()
             if session is None:
                 session = Session.begin(
                     self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras

@@ -119,7 +119,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     give_up_s, settled_s = now_s + _RESTING_S, np.inf
     with BallFinder(session, patient=feed.replays) as finder:
         while now_s < min(give_up_s, settled_s) and not feed.over:
-            finder.look(feed.newest())
+            finder.submit(feed.newest())
             for ball in finder.found():
                 recent[ball.camera].append(ball)
             still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
@@ -190,7 +190,7 @@ def wave_ball(
                         write()
                         session.begin_run()
                         resets[frame.camera] = frame.clock_resets
-                    finder.look([frame])
+                    finder.submit([frame])
                 keep(finder.found())
                 now_s = time.monotonic()
                 if now_s - written_s > _WRITE_EVERY_S:
@@ -213,7 +213,7 @@ def wave_ball(
         guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
-    for name, (near, moments) in coverage.ties().items():
+    for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} is tied to {near} by {moments} moments at which both saw it")
     if not coverage.enough:
         guide.say(f"more would help: {coverage.advice()}")

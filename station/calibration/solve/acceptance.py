@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.equations import recentred
+from station.calibration.adjust.equations import corrected_centers
 from station.calibration.adjust.problem import Problem, Sightings, State
 from station.calibration.solve.pairwise import Track
 from station.core.geometry import transform
@@ -65,7 +65,7 @@ def without_held_out(problem: Problem) -> Problem:
     return replace(problem, waved=waved)
 
 
-def compare(problem: Problem, state: State) -> dict[str, HeldOut]:
+def compare_held_out(problem: Problem, state: State) -> dict[str, HeldOut]:
     """Each camera's held-out detections against the other cameras', by a state solved without."""
     start_s = _start(problem)
     tracks = {name: corrected(seen, problem, state) for name, seen in problem.waved.items()}
@@ -136,7 +136,7 @@ def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -
 def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
     """Detections in the reference frame after depth correction and clock offset."""
     name = seen.camera
-    centers = recentred(
+    centers = corrected_centers(
         seen, problem.cameras[name], problem.model, state.sensors[name], state.radius_m
     )
     return Track(seen.times_s + state.clock_s[name], transform(state.poses[name], centers))

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.solve.pairwise import GATE_M, Pair, Track, match, relate
+from station.calibration.solve.pairwise import GATE_M, Pair, Track, estimate_pair, match
 from station.core.geometry import transform
 
 Array = NDArray[np.float64]
@@ -122,7 +122,7 @@ def _stands_elsewhere(
     for (a, b), drop in drops.items():
         late = tracks[a].times_s >= cut_s
         side = late if drop > 0.0 else ~late
-        pair = relate(Track(tracks[a].times_s[side], tracks[a].points[side]), tracks[b])
+        pair = estimate_pair(Track(tracks[a].times_s[side], tracks[a].points[side]), tracks[b])
         shares.append(0.0 if pair is None else float(pair.agree.mean()))
     return float(np.median(shares)) > _AGREEING
 

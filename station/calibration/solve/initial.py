@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.equations import bow_terms, recentred
+from station.calibration.adjust.equations import bow_terms, corrected_centers
 from station.calibration.adjust.problem import Problem, Sightings, State, Surface
-from station.calibration.adjust.trajectory import TimeGrid, along
+from station.calibration.adjust.trajectory import TimeGrid, path_points
 from station.calibration.detect.detections import FLOOR, MARK, BallDetection, PlaneObservation
 from station.calibration.solve.pairwise import GATE_M, Track
 from station.core.geometry import transform
@@ -104,7 +104,7 @@ def confirmed(detections: Mapping[str, Detections], poses: Mapping[str, Array]) 
     return found
 
 
-def at_rest(
+def resting_sightings(
     detections: Sequence[BallDetection], camera: CameraCalibration, radius_m: float
 ) -> Sightings | None:
     """A camera's detections of a resting ball that agree with their median."""
@@ -238,7 +238,7 @@ def first_state(problem: Problem, poses: Mapping[str, Array]) -> State:
     )
 
 
-def continued(problem: Problem, training: Problem, solved: State) -> State:
+def extended_state(problem: Problem, training: Problem, solved: State) -> State:
     """The state that a solution without the held-out seconds gives all of the problem.
 
     The path goes through its own points at the times that were solved for, and through corrected
@@ -249,18 +249,18 @@ def continued(problem: Problem, training: Problem, solved: State) -> State:
         [seen.times_s + solved.clock_s[name] for name, seen in training.waved.items()]
     )
     first, value, _ = solved.grid.basis(known)
-    points = along(solved.controls, first, value)
+    points = path_points(solved.controls, first, value)
     grid = TimeGrid.over(np.concatenate([seen.times_s for seen in problem.waved.values()]))
     weights = np.full(len(known), _PATH_WEIGHT)
     bridged = grid.fit(known, points, weights)
     times, places = [known], [points]
     for name, seen in problem.waved.items():
-        centers = recentred(
+        centers = corrected_centers(
             seen, problem.cameras[name], problem.model, solved.sensors[name], solved.radius_m
         )
         found, when = transform(solved.poses[name], centers), seen.times_s + solved.clock_s[name]
         first, value, _ = grid.basis(when)
-        near = np.linalg.norm(found - along(bridged, first, value), axis=1) < _BRIDGED_M
+        near = np.linalg.norm(found - path_points(bridged, first, value), axis=1) < _BRIDGED_M
         times.append(when[near])
         places.append(found[near])
     every, there = np.concatenate(times), np.concatenate(places)

@@ -68,7 +68,7 @@ def match(a: Track, b: Track, shift_s: float = 0.0) -> tuple[Array, Array, Array
     return a.times_s[known], a.points[known], places[known]
 
 
-def relate(a: Track, b: Track, seed: int = 0) -> Pair | None:
+def estimate_pair(a: Track, b: Track, seed: int = 0) -> Pair | None:
     """The transform that most matches agree upon; None with too few matches."""
     times, in_a, in_b = match(a, b)
     if len(times) < MIN_MATCHES:
@@ -95,17 +95,17 @@ def relate(a: Track, b: Track, seed: int = 0) -> Pair | None:
     return Pair(best, times, error < GATE_M, error)
 
 
-def relate_all(tracks: Mapping[str, Track]) -> dict[tuple[str, str], Pair]:
+def estimate_pairs(tracks: Mapping[str, Track]) -> dict[tuple[str, str], Pair]:
     """Every pair of cameras that agree upon enough."""
     found = {}
     for a, b in combinations(tracks, 2):
-        pair = relate(tracks[a], tracks[b])
+        pair = estimate_pair(tracks[a], tracks[b])
         if pair is not None and pair.agree.sum() >= MIN_MATCHES:
             found[a, b] = pair
     return found
 
 
-def chain(
+def chain_poses(
     pairs: Mapping[tuple[str, str], Pair], reference: str, cameras: Sequence[str]
 ) -> dict[str, Array]:
     """reference_from_camera of all that are tied to the reference, strongest ties first."""

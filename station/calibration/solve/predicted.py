@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from station.calibration.adjust.problem import Layout, Problem, State
 from station.calibration.adjust.sensor_model import LENS, POLYNOMIAL, SensorModel, image_place
-from station.calibration.solve.world import Placed
+from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, skew, transform
 from station.core.lens import pixel_rays, project
@@ -32,8 +32,11 @@ _FACING = 0.35
 _DEPTHS_M = (0.6, 3.0)
 
 
-def predict(
-    problem: Problem, state: State, placed: Placed, cameras: Mapping[str, CameraCalibration]
+def predict_errors(
+    problem: Problem,
+    state: State,
+    world_poses: WorldPoses,
+    cameras: Mapping[str, CameraCalibration],
 ) -> PredictedError:
     """Standard deviations of what the calibration adds to a scan; ``cameras`` as solved.
 
@@ -43,7 +46,7 @@ def predict(
     layout = Layout.of(problem)
 
     def seen(points: Array, directions: Array) -> Array:
-        rows = _rows(problem.model, layout, placed, cameras, points, directions)
+        rows = _rows(problem.model, layout, world_poses, cameras, points, directions)
         if not len(rows):
             raise CalibrationError(
                 f"no camera sees {points[0, 2]:.2f} m above the mark: turn a camera there, and "
@@ -67,7 +70,7 @@ def predict(
         height_sigma_m=sigma(crown),
         girth_sigma_m=max(girths),
         normal_rms_m=float(np.sqrt(variance.mean())),
-        tilt_sigma_rad=placed.slope_sigma_rad,
+        tilt_sigma_rad=world_poses.slope_sigma_rad,
     )
 
 
@@ -88,13 +91,13 @@ def _ring(height_m: float) -> tuple[Array, Array]:
 
 
 def _rows(
-    model: SensorModel, layout: Layout, placed: Placed,
+    model: SensorModel, layout: Layout, world_poses: WorldPoses,
     cameras: Mapping[str, CameraCalibration], points: Array, directions: Array,
 ) -> Array:  # fmt: skip
     """Derivatives (n, m) of points along directions by all unknowns, of those that are seen."""
     total, seen = np.zeros((len(points), layout.size)), np.zeros(len(points))
     for place, (name, camera) in enumerate(cameras.items()):
-        pose = placed.world_from_camera[name]
+        pose = world_poses.world_from_camera[name]
         local = transform(invert(pose), points)
         pixels = project(camera, local)
         towards = pose[:3, 3] - points
@@ -109,7 +112,7 @@ def _rows(
         weight = np.where(upward, 1.0, facing)[good]
         row = np.zeros((len(local), layout.size))
         twist = np.concatenate([-np.einsum("ni,nij->nj", along, skew(local)), along], axis=1)
-        row += twist @ placed.jacobian[6 * place : 6 * place + 6]
+        row += twist @ world_poses.jacobian[6 * place : 6 * place + 6]
         index = layout.sensor(name)
         inverse = 1.0 / local[:, 2]
         where = image_place(camera, pixels)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.looks import MEDIAN
 from station.calibration.adjust.problem import State
+from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, Observations
 from station.calibration.solve import clocks
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections
 from station.calibration.solve.pairwise import Pair
-from station.calibration.solve.world import Placed
+from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 from station.core.rig import PredictedError
 
@@ -27,7 +27,7 @@ _RADIUS_SHARE = 0.04
 _MIN_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
 _LARGEST_SCATTER = 3.0
-SETTLED, LOST = 0.3, 10.0
+CONVERGED, DIVERGED = 0.3, 10.0
 """Last steps, in standard deviations: beyond the second nobody can tell whose fault it is."""
 _MARK_TOLERANCE_M = 0.008
 _LARGEST_SLOPE_RAD = np.radians(0.15)
@@ -118,7 +118,7 @@ def check_clocks(jump: clocks.ClockJump | None) -> None:
         )
 
 
-def check_tied(cameras: Iterable[str], poses: Mapping[str, Array]) -> None:
+def check_connected(cameras: Iterable[str], poses: Mapping[str, Array]) -> None:
     apart = [name for name in cameras if name not in poses]
     if apart:
         raise CalibrationError(
@@ -137,7 +137,7 @@ def check_scatter(state: State) -> None:
             )
 
 
-def check_settled(state: State, largest_step: float = SETTLED) -> None:
+def check_converged(state: State, largest_step: float = CONVERGED) -> None:
     if not state.last_step < largest_step:
         raise CalibrationError(
             "the cameras contradict one another: a head or something else that is round may have "
@@ -186,16 +186,16 @@ def check_predicted(
             )
 
 
-def check_slope(placed: Placed) -> None:
-    if placed.slope_sigma_rad > _LARGEST_SLOPE_RAD:
+def check_slope(world_poses: WorldPoses) -> None:
+    if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         raise CalibrationError(
-            f"the floor's slope is known to {np.degrees(placed.slope_sigma_rad):.2f} degrees only: "
-            f"{AROUND_WORDS}"
+            "the floor's slope is known to "
+            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees only: {AROUND_WORDS}"
         )
 
 
-def check_upright(placed: Placed) -> None:
-    for name, pose in placed.world_from_camera.items():
+def check_upright(world_poses: WorldPoses) -> None:
+    for name, pose in world_poses.world_from_camera.items():
         if pose[2, 3] < 0.0:
             raise CalibrationError(
                 f"camera {name} comes out {-pose[2, 3]:.2f} m below the floor: what was taken for "
@@ -204,8 +204,8 @@ def check_upright(placed: Placed) -> None:
             )
 
 
-def check_mark(placed: Placed, radius_m: float) -> None:
-    off = placed.mark_height_m - radius_m
+def check_mark(world_poses: WorldPoses, radius_m: float) -> None:
+    off = world_poses.mark_height_m - radius_m
     if abs(off) > _MARK_TOLERANCE_M:
         raise CalibrationError(
             f"the ball on the mark is {1e3 * abs(off):.0f} mm too {'high' if off > 0 else 'low'} "

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from station.calibration.adjust.averaging import averaged, likeliest
+from station.calibration.adjust.averaging import averaged_state, most_probable_widths
 from station.calibration.adjust.joint import solve_joint
 from station.calibration.adjust.problem import Problem, Sightings, State
 from station.calibration.adjust.sensor_model import COARSE, SensorModel
@@ -24,20 +24,20 @@ from station.calibration.solve import acceptance, clocks, refusals, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
     Detections,
-    at_rest,
     confirmed,
-    continued,
+    extended_state,
     first_state,
     named_surfaces,
     resting_places,
+    resting_sightings,
     sorted_detections,
     spread_m,
     with_bow,
 )
-from station.calibration.solve.pairwise import chain, relate_all
-from station.calibration.solve.predicted import predict
+from station.calibration.solve.pairwise import chain_poses, estimate_pairs
+from station.calibration.solve.predicted import predict_errors
 from station.calibration.solve.refusals import Limits
-from station.calibration.solve.world import Placed
+from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 from station.core.rig import CameraCalibration, Rig
 
@@ -55,7 +55,7 @@ class Solution:
     """A calibration and how good it is."""
 
     rig: Rig
-    placed: Placed
+    world_poses: WorldPoses
     """Poses with the covariance between cameras."""
     held_out: Mapping[str, HeldOut]
     weak: tuple[str, ...]
@@ -84,18 +84,18 @@ class Solution:
                 f"{2e3 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
                 f"{2e3 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
             )
-        slope_deg = np.degrees(self.placed.slope_sigma_rad)
+        slope_deg = np.degrees(self.world_poses.slope_sigma_rad)
         lines.append(f"the floor's slope is known to {slope_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
 
     @property
     def report(self) -> dict[str, Any]:
         """For a JSON file beside the calibration."""
-        names = list(self.placed.world_from_camera)
+        names = list(self.world_poses.world_from_camera)
         return {
             "residual_rms_m": self.rig.residual_rms_m,
             "measured_radius_m": self.radius_m,
-            "slope_sigma_rad": self.placed.slope_sigma_rad,
+            "slope_sigma_rad": self.world_poses.slope_sigma_rad,
             "weak": list(self.weak),
             "cameras": {
                 name: {
@@ -108,11 +108,11 @@ class Solution:
                 }
                 for name in names
             },
-            "joint_covariance": {"cameras": names, "xi": self.placed.covariance.tolist()},
+            "joint_covariance": {"cameras": names, "xi": self.world_poses.covariance.tolist()},
         }
 
     def _sigma(self, name: str) -> tuple[float, float]:
-        return world.sigma_to(self.placed, self.rig.reference, name)
+        return world.pose_sigma(self.world_poses, self.rig.reference, name)
 
 
 def solve(
@@ -162,10 +162,10 @@ def _solve(
     refusals.check_rest(observations, front_cameras)
 
     progress("relating pairs of cameras")
-    pairs = relate_all({name: own.track for name, own in detections.items()})
+    pairs = estimate_pairs({name: own.track for name, own in detections.items()})
     refusals.check_pairs(detections, pairs)
-    poses = chain(pairs, reference, list(cameras))
-    refusals.check_tied(cameras, poses)
+    poses = chain_poses(pairs, reference, list(cameras))
+    refusals.check_connected(cameras, poses)
 
     problem = _problem(observations, cameras, detections, poses, radius_m, reference)
     progress("solving without every fifth second")
@@ -173,30 +173,30 @@ def _solve(
 
     progress("solving with all that was seen")
     try:
-        problem = replace(problem, widths=likeliest(training, tested))
-        start = continued(problem, training, tested)
+        problem = replace(problem, widths=most_probable_widths(training, tested))
+        start = extended_state(problem, training, tested)
         state = solve_joint(problem, start, _FINE_ITERATIONS)
-        refusals.check_settled(state)
-        state = averaged(problem, state)
+        refusals.check_converged(state)
+        state = averaged_state(problem, state)
     except np.linalg.LinAlgError:
         # Equations without a solution come from detections that contradict one another.
-        refusals.check_settled(replace(tested, last_step=np.inf))
+        refusals.check_converged(replace(tested, last_step=np.inf))
         raise
-    placed = world.place(problem, state, front_cameras)
-    refusals.check_upright(placed)
-    refusals.check_slope(placed)
-    refusals.check_mark(placed, radius_m)
-    rig = _rig(problem, placed, state, created, acceptance.overall_rms(found))
-    predicted = acceptance.inflated(predict(problem, state, placed, rig.cameras), found)
+    world_poses = world.poses_in_world(problem, state, front_cameras)
+    refusals.check_upright(world_poses)
+    refusals.check_slope(world_poses)
+    refusals.check_mark(world_poses, radius_m)
+    rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
+    predicted = acceptance.inflated(predict_errors(problem, state, world_poses, rig.cameras), found)
     stood = bool(problem.heights_m)
     refusals.check_predicted(predicted, limits, covered, stood)
     rig = replace(rig, predicted=predicted)
     weak = [] if covered.enough else [covered.advice()]
     if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
         weak.append(f"for heights, {refusals.remedy(stood)}")
-    if placed.slope_sigma_rad > _GOOD_SLOPE_RAD:
+    if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
         weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
-    return Solution(rig, placed, found, tuple(weak), state.clock_s, measured_m)
+    return Solution(rig, world_poses, found, tuple(weak), state.clock_s, measured_m)
 
 
 def _tested(
@@ -205,11 +205,11 @@ def _tested(
     """The problem without the held-out seconds, its solution, and how that does in them."""
     training = acceptance.without_held_out(replace(problem, model=COARSE))
     coarse = solve_joint(training, first_state(training, poses), informed=False)
-    refusals.check_settled(coarse, refusals.LOST)
+    refusals.check_converged(coarse, refusals.DIVERGED)
     training = replace(training, model=problem.model)
     tested = solve_joint(training, _refined(coarse, COARSE, problem.model), _FINE_ITERATIONS)
-    refusals.check_settled(tested, refusals.LOST)
-    found = acceptance.compare(problem, tested)
+    refusals.check_converged(tested, refusals.DIVERGED)
+    found = acceptance.compare_held_out(problem, tested)
     refusals.check_clocks(
         clocks.small_jump(
             {
@@ -242,7 +242,7 @@ def _problem(
     resting: dict[str, list[Sightings]] = {}
     places = {MARK: observations.mark, FRONT: observations.front, **observations.around}
     for place, seen in places.items():
-        views = [at_rest(seen, camera, radius_m) for camera in cameras.values()]
+        views = [resting_sightings(seen, camera, radius_m) for camera in cameras.values()]
         there = [view for view in views if view is not None]
         if there:
             resting[place] = there
@@ -277,14 +277,16 @@ def _refined(state: State, coarse: SensorModel, fine: SensorModel) -> State:
     return replace(state, sensors=sensors)
 
 
-def _rig(problem: Problem, placed: Placed, state: State, created: str, rms_m: float) -> Rig:
+def _rig(
+    problem: Problem, world_poses: WorldPoses, state: State, created: str, rms_m: float
+) -> Rig:
     solved = {}
     for i, (name, camera) in enumerate(problem.cameras.items()):
         own = np.s_[6 * i : 6 * i + 6]
         solved[name] = replace(
             problem.model.camera(camera, state.sensors[name]),
             depth_correction=problem.model.correction(state.sensors[name]),
-            world_from_camera=placed.world_from_camera[name],
-            covariance=placed.covariance[own, own],
+            world_from_camera=world_poses.world_from_camera[name],
+            covariance=world_poses.covariance[own, own],
         )
     return Rig(created, problem.reference, solved, rms_m)

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """The cameras in the world."""
+class WorldPoses:
+    """The cameras' poses in the world frame and their joint covariance."""
 
     world_from_camera: Mapping[str, Array]
     covariance: Array
@@ -52,7 +52,7 @@ def world_from_reference(state: State, front_cameras: Sequence[str]) -> Array:
     return rigid(rotation, -rotation @ origin)
 
 
-def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Placed:
+def poses_in_world(problem: Problem, state: State, front_cameras: Sequence[str]) -> WorldPoses:
     """Every camera's pose in the world and the joint covariance of all of them."""
 
     def poses(at: State) -> Array:
@@ -73,7 +73,7 @@ def place(problem: Problem, state: State, front_cameras: Sequence[str]) -> Place
         step[i] = 0.1 * sigma[i]
         ends = [twists(moved_state(problem, layout, state, sign * step)) for sign in (1.0, -1.0)]
         jacobian[:, i] = (ends[0] - ends[1]) / (0.2 * sigma[i])
-    return Placed(
+    return WorldPoses(
         jacobian=jacobian,
         world_from_camera=dict(zip(problem.cameras, here, strict=True)),
         covariance=jacobian @ state.covariance @ jacobian.T,
@@ -91,37 +91,39 @@ def _slope_sigma(layout: Layout, state: State) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def relatives(placed: Placed, a: str, others: Sequence[str]) -> tuple[list[Array], Array]:
+def relative_poses(
+    world_poses: WorldPoses, a: str, others: Sequence[str]
+) -> tuple[list[Array], Array]:
     """a_from_b (4, 4) of each other camera b, and the covariance (6 k, 6 k) of all their xi.
 
     xi is in camera b's frame: a_from_b @ se3_exp(xi).
     """
-    names = list(placed.world_from_camera)
+    names = list(world_poses.world_from_camera)
     i = names.index(a)
     found = []
     select = np.zeros((6 * len(others), 6 * len(names)))
     for row, b in enumerate(others):
         j = names.index(b)
-        a_from_b = invert(placed.world_from_camera[a]) @ placed.world_from_camera[b]
+        a_from_b = invert(world_poses.world_from_camera[a]) @ world_poses.world_from_camera[b]
         rows = np.s_[6 * row : 6 * row + 6]
         # exp(-xi_a) a_from_b exp(xi_b): what stands on the left is carried to the right side.
         select[rows, 6 * i : 6 * i + 6] -= adjoint(invert(a_from_b))
         select[rows, 6 * j : 6 * j + 6] += np.eye(6)
         found.append(a_from_b)
-    return found, select @ placed.covariance @ select.T
+    return found, select @ world_poses.covariance @ select.T
 
 
-def relative(placed: Placed, a: str, b: str) -> tuple[Array, Array]:
+def relative_pose(world_poses: WorldPoses, a: str, b: str) -> tuple[Array, Array]:
     """a_from_b (4, 4) and the covariance (6, 6) of its xi, in camera b's frame."""
-    transforms, covariance = relatives(placed, a, [b])
+    transforms, covariance = relative_poses(world_poses, a, [b])
     return transforms[0], covariance
 
 
-def sigma_to(placed: Placed, reference: str, name: str) -> tuple[float, float]:
+def pose_sigma(world_poses: WorldPoses, reference: str, name: str) -> tuple[float, float]:
     """Largest standard deviations of a camera's place (m) and turn (rad) from the reference's."""
     if name == reference:
         return 0.0, 0.0
-    _, covariance = relative(placed, reference, name)
+    _, covariance = relative_pose(world_poses, reference, name)
     return (
         float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])),
         float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])),

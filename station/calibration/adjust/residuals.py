@@ -8,9 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.equations import BallRows, Balls, ball_rows, center_equations
+from station.calibration.adjust.equations import (
+    BallEquations,
+    BallRows,
+    ball_rows,
+    center_equations,
+)
 from station.calibration.adjust.problem import Indices, Problem, Sightings, State
-from station.calibration.adjust.trajectory import along
+from station.calibration.adjust.trajectory import path_points
 
 Array = NDArray[np.float64]
 
@@ -28,7 +33,7 @@ MEDIAN = 2.366
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class DetectionResiduals:
     """One camera's detections (n) at a state."""
 
     centers: Array
@@ -48,19 +53,21 @@ class Look:
     """... and the rates of these."""
 
     @classmethod
-    def along_path(cls, problem: Problem, state: State, seen: Sightings) -> Look:
+    def along_path(cls, problem: Problem, state: State, seen: Sightings) -> DetectionResiduals:
         """Detections of the waved ball."""
         pose = state.poses[seen.camera]
         basis = state.grid.basis(seen.times_s + state.clock_s[seen.camera])
-        centers = (along(state.controls, *basis[:2]) - pose[:3, 3]) @ pose[:3, :3]
+        centers = (path_points(state.controls, *basis[:2]) - pose[:3, 3]) @ pose[:3, :3]
         near = _near(centers, seen.centers)
         rows = _rows(problem, state, seen, near)
         balls = _without_sensor(seen, rows).moved(centers - near)
-        deviation = _deviation(balls.off_center(problem.radius_m, np.ones(len(centers))))
+        deviation = _deviation(balls.marginalised(problem.radius_m, np.ones(len(centers))))
         return cls(centers, near, rows, deviation, _robust_weight(deviation), *basis)
 
     @classmethod
-    def at_rest(cls, problem: Problem, state: State, seen: Sightings, centers: Array) -> Look:
+    def at_rest(
+        cls, problem: Problem, state: State, seen: Sightings, centers: Array
+    ) -> DetectionResiduals:
         """Detections of a ball that rests."""
         rows = _rows(problem, state, seen, centers)
         deviation = _deviation(_without_sensor(seen, rows))
@@ -69,7 +76,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitness:
+class FitQuality:
     """Agreement of the waved detections with a state."""
 
     deviations: Mapping[str, Array]
@@ -77,18 +84,18 @@ class Fitness:
     """Observed over expected standard deviation of the detections' centres."""
 
     @classmethod
-    def of(cls, problem: Problem, state: State) -> Fitness:
+    def of(cls, problem: Problem, state: State) -> FitQuality:
         deviations, cost, count = {}, 0.0, 0.0
         share = np.zeros(state.grid.count)
         for name, seen in problem.waved.items():
             if not len(seen.times_s):
                 continue
-            look = Look.along_path(problem, state, seen)
-            deviations[name] = look.deviation
-            cost += float(np.sum(look.robust * np.minimum(look.deviation, _GATE)))
-            count += float(np.sum(look.robust))
+            residuals = DetectionResiduals.along_path(problem, state, seen)
+            deviations[name] = residuals.deviation
+            cost += float(np.sum(residuals.robust * np.minimum(residuals.deviation, _GATE)))
+            count += float(np.sum(residuals.robust))
             for k in range(4):
-                np.add.at(share, look.first + k, 0.25 * look.robust)
+                np.add.at(share, residuals.first + k, 0.25 * residuals.robust)
         unknowns = 3.0 * np.sum(np.abs(share) > 0.5) + 12 * len(problem.cameras)
         return cls(deviations, float(np.sqrt(cost / max(3.0 * count - unknowns, 1.0))))
 
@@ -100,12 +107,14 @@ def _rows(problem: Problem, state: State, seen: Sightings, centers: Array) -> Ba
     )
 
 
-def _without_sensor(seen: Sightings, rows: BallRows) -> Balls:
+def _without_sensor(seen: Sightings, rows: BallRows) -> BallEquations:
     matrix, gradient = center_equations(seen, rows)
-    return Balls(matrix, gradient, np.zeros((len(matrix), 4, 0)), np.zeros((0, 0)), np.zeros(0))
+    return BallEquations(
+        matrix, gradient, np.zeros((len(matrix), 4, 0)), np.zeros((0, 0)), np.zeros(0)
+    )
 
 
-def _deviation(balls: Balls) -> Array:
+def _deviation(balls: BallEquations) -> Array:
     inner, right = balls.matrix[:, :3, :3], balls.gradient[:, :3]
     solved = np.linalg.solve(inner, right[..., None])[..., 0]
     return np.asarray(np.einsum("ni,ni->n", right, solved))
