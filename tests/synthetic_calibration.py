@@ -343,7 +343,7 @@ FAULTS = (
     Fault(
         "no floor, and the ball on one line",
         lambda seen: replace(seen, planes=(), around={"around-2": seen.around["around-2"]}),
-        "away from one line",
+        "that form a triangle",
     ),
     Fault(
         "a clock reset by a second",

@@ -110,7 +110,7 @@ def test_steps_in_the_wrong_order_say_which_comes_first(config: Path, recordings
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 1
-    assert "no calibration has been begun" in done.stderr
+    assert "no calibration has been started" in done.stderr
     moved = config.parent / "only-ball"
     shutil.copytree(recordings / BALL, moved / "wall-0", copy_function=os.link)
     done = _run(config, moved, "depth")
@@ -123,7 +123,7 @@ def test_another_ball_is_not_mixed_in(config: Path, recordings: Path) -> None:
     config.write_text(config.read_text().replace("[calibrate]", "[calibrate]\nball_radius_m = 0.2"))
     done = _run(config, recordings, "ball")
     assert done.returncode == 1
-    assert "ball of 0.1 m and booth.toml says 0.2 m" in done.stderr
+    assert "radius of 0.1 m, but booth.toml says 0.2 m" in done.stderr
     anew = _run(config, config.parent, "--new")
     assert "what was seen so far is kept" in anew.stdout
     assert (config.parent / "calibrations/abandoned-1/scene/front-lower.npz").exists()

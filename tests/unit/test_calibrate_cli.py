@@ -61,7 +61,7 @@ def test_stored_calibrations_are_listed_and_put_into_use(
     listed = _run(config, "--list").output.splitlines()
     assert listed[0].startswith("* 20261101T100000Z  4 cameras")
     assert listed[1].startswith("  20261102T100000Z")
-    assert "unfinished, begun 2026-11-21T10:00:00Z" in listed[2]
+    assert "unfinished, started 2026-11-21T10:00:00Z" in listed[2]
     wrong = _run(config, "--use", "yesterday")
     assert isinstance(wrong.exception, CalibrationError)
     assert "20261101T100000Z, 20261102T100000Z" in str(wrong.exception)
@@ -84,14 +84,14 @@ def test_a_solution_takes_the_ball_that_was_waved(config: Path, store: Calibrati
     assert "the ball has not been waved yet: station calibrate ball" in str(refused.exception)
     config.write_text("[calibrate]\nball_radius_m = 0.12\n" + config.read_text())
     refused = _run(config, "solve")
-    assert "with a ball of 0.1 m and booth.toml says 0.12 m" in str(refused.exception)
+    assert "with a radius of 0.1 m, but booth.toml says 0.12 m" in str(refused.exception)
     assert "station calibrate --new" in str(refused.exception)
 
 
 def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore) -> None:
     _begin(store)
     listed = _run(config, "--list").output
-    assert listed == "  unfinished, begun 2026-11-21T10:00:00Z: nothing yet\n"
+    assert listed == "  unfinished, started 2026-11-21T10:00:00Z: nothing yet\n"
 
 
 def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationStore) -> None:
@@ -134,7 +134,7 @@ def test_a_board_is_looked_for_in_a_folder_of_images(config: Path, store: Calibr
     images = config.parent / "images"
     _draw_boards(images, Board(7, 5, 0.06, 0.045))
     before = _run(config, "board", "--images", str(images))
-    assert "no calibration has been begun" in str(before.exception)
+    assert "no calibration has been started" in str(before.exception)
     _begin(store)
     done = _run(config, "board", "--images", str(images))
     assert done.exit_code == 0, done.output

@@ -109,7 +109,7 @@ def test_the_ball_shows_a_floor_that_no_camera_sees(
 def test_a_slope_that_is_hardly_known_is_refused() -> None:
     procedure = VirtualProcedure(synthetic.booth(101), around_m=((0.45, 0.0),))
     seen = replace(synthetic.observations(procedure), planes=())
-    with pytest.raises(CalibrationError, match=r"slope is known to 0\.1\d degrees only"):
+    with pytest.raises(CalibrationError, match=r"slope is only known to within 0\.1\d degrees"):
         solved(procedure.booth.rig, seen)
 
 
@@ -199,7 +199,7 @@ def test_what_does_not_settle_is_refused(
     procedure: VirtualProcedure, seen: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(solution_module, "_FINE_ITERATIONS", 1)
-    with pytest.raises(CalibrationError, match="the cameras contradict one another"):
+    with pytest.raises(CalibrationError, match="the cameras do not agree on where the ball was"):
         solved(procedure.booth.rig, seen)
 
 
@@ -219,7 +219,7 @@ def test_a_head_that_is_seen_all_along_blames_no_sound_camera(
             time_s,
         )
     ]
-    with pytest.raises(CalibrationError, match="the cameras contradict one another"):
+    with pytest.raises(CalibrationError, match="the cameras do not agree on where the ball was"):
         solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
 
 

@@ -215,4 +215,4 @@ def test_one_corner_of_the_image_is_not_enough() -> None:
         for index, name in enumerate(CAMERAS):
             coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (-0.3, -0.3, 1.5)))
     assert not coverage.enough
-    assert "misses it" in coverage.advice() or "nearer" in coverage.advice()
+    assert "in the image of" in coverage.advice() or "nearer" in coverage.advice()

@@ -50,8 +50,8 @@ def _nothing_seen() -> Coverage:
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        (Limits(height_m=1.9e-3), "heights could be wrong by 2.0 mm, and 2 mm are allowed"),
-        (Limits(girth_m=2.9e-3), "girths could be wrong by 2.9 mm, and 3 mm are allowed"),
+        (Limits(height_m=1.9e-3), "heights could be wrong by up to 2.0 mm, but the limit is 2 mm"),
+        (Limits(girth_m=2.9e-3), "girths could be wrong by up to 2.9 mm, but the limit is 3 mm"),
     ],
 )
 def test_what_could_spoil_sizes_is_refused(limits: Limits, words: str) -> None:

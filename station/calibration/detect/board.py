@@ -63,8 +63,9 @@ class Board:
             )
         if min(self.columns, self.rows) < 3 or not 0 < self.marker_m < self.square_m:
             raise CalibrationError(
-                f"a board of {self.columns} x {self.rows} squares of {self.square_m} m, markers of "
-                f"{self.marker_m} m cannot be: at least 3 x 3, markers smaller than squares"
+                f"a board of {self.columns} x {self.rows} squares of {self.square_m} m with "
+                f"markers of {self.marker_m} m is not possible: use at least 3 x 3 squares, and "
+                "markers smaller than the squares"
             )
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         if dictionary.bytesList.shape[0] < self.columns * self.rows // 2:
@@ -166,7 +167,7 @@ def _check_layout(board: Board, moment: str, pixels: Array, ids: NDArray[np.inte
     mapping, _ = cv2.findHomography(flat.astype(np.float64), seen, cv2.LMEDS)
     off = seen - cv2.perspectiveTransform(flat[:, None].astype(np.float64), mapping)[:, 0]
     if float(np.percentile(np.linalg.norm(off, axis=1), 90)) > _OTHER_LAYOUT_PX:
-        raise CalibrationError(f"image {moment}: its markers lie otherwise, {another}")
+        raise CalibrationError(f"image {moment}: its markers are arranged differently, {another}")
 
 
 def judge_lens(camera: CameraCalibration, views: Sequence[BoardView], board: Board) -> LensReport:

@@ -23,7 +23,7 @@ _CELLS = 6
 """Regions to be filled, of nine: not every one can be reached within the booth."""
 _DEPTH_SPREAD_M = 0.12
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "middle", "right")
-_GO = {"top": "higher", "bottom": "lower", "middle": "at half its height"}
+_GO = {"top": "higher", "bottom": "lower", "middle": "in the middle"}
 
 
 class Coverage:
@@ -100,7 +100,9 @@ class Coverage:
                 filled = int((self._cells[name] >= _CELL_SEEN).sum())
                 needs.append((filled / _CELLS, self._where_words(name)))
         for name, (near, count) in self.links().items():
-            words = f"hold it where both {name} and {near} see it ({count} of {_ENOUGH_TOGETHER})"
+            words = (
+                f"hold the ball where both {name} and {near} see it ({count} of {_ENOUGH_TOGETHER})"
+            )
             needs.append((count / _ENOUGH_TOGETHER, words))
         return needs
 
@@ -115,4 +117,4 @@ class Coverage:
     def _where_words(self, name: str) -> str:
         row, column = divmod(int(np.argmin(self._cells[name])), 3)
         side = f", to the {_COLUMNS[column]}" if column != 1 else ""
-        return f"{name} misses it {_GO[_ROWS[row]]}{side} as it sees it"
+        return f"in the image of {name}, hold the ball {_GO[_ROWS[row]]}{side}"

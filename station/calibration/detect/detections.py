@@ -132,7 +132,7 @@ class PlaneObservation:
                 patches=_numbers(document["patches"], (None, 4)),
             )
         except (KeyError, TypeError, ValueError) as cause:
-            raise FormatError(f"a seen surface cannot be read ({cause})") from None
+            raise FormatError(f"a plane observation cannot be read ({cause})") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,8 +79,8 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool) -> N
         percent = 100.0 * (1.0 - most.share)
         click.echo(
             f"the booth does not look as it did when it was calibrated ({percent:.0f} % of what "
-            f"camera {most.camera} sees differs): take out whoever and whatever was not "
-            "there, put back what is missing, and small moves are noticed better"
+            f"camera {most.camera} sees differs): remove people and objects that were "
+            "not there and put back what is missing, so that small moves can be detected"
         )
     if any(move.moved or move.lost for move in moves):
         sys.exit(_EXIT_MOVED)

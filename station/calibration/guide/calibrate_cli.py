@@ -40,7 +40,9 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         type=click.Path(path_type=Path, exists=True, file_okay=False),
         help="replay DIR/<step>/<camera> instead of the live cameras",
     )
-    @click.option("--yes", is_flag=True, help="wait for nobody: no questions, no countdown")
+    @click.option(
+        "--yes", is_flag=True, help="do not wait for the operator: no questions, no countdown"
+    )
     @functools.wraps(command)
     def wrapped(
         *args: Any, config_path: Path | None, recordings: Path | None, yes: bool, **kwargs: Any
@@ -67,7 +69,7 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.group(invoke_without_command=True)
 @click.option("--use", "use_name", metavar="DATE", help="put a stored calibration into use")
 @click.option("--list", "list_them", is_flag=True, help="show the stored calibrations")
-@click.option("--new", is_flag=True, help="begin anew; what was seen so far is set aside")
+@click.option("--new", is_flag=True, help="start again; the unfinished calibration is set aside")
 @_options
 def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: bool) -> None:
     """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
@@ -105,7 +107,7 @@ def _list(procedure: Procedure) -> None:
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms"
         )
     if session is not None:
-        click.echo(f"  unfinished, begun {session.started}: {session.summary()}")
+        click.echo(f"  unfinished, started {session.started}: {session.summary()}")
 
 
 @calibrate.command("floor")
@@ -121,7 +123,7 @@ def floor(procedure: Procedure) -> None:
 
 
 @calibrate.command("ball")
-@click.option("--again", is_flag=True, help="forget what was seen of the ball before")
+@click.option("--again", is_flag=True, help="discard the earlier recordings of the ball")
 @_options
 def ball(procedure: Procedure, again: bool) -> None:
     """Wave the ball; what is seen is added to what was seen before.

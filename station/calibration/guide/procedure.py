@@ -57,7 +57,7 @@ class Procedure:
         if session is None:
             last = self.store.newest()
             raise CalibrationError(
-                "no calibration has been begun; station calibrate goes through all steps"
+                "no calibration has been started; station calibrate goes through all steps"
                 if last is None
                 else f"the last calibration, {last}, is finished; station calibrate begins another"
             )
@@ -67,8 +67,10 @@ class Procedure:
         """All steps that are not done yet."""
         session = self.unfinished_session()
         if session is not None:
-            self.guide.say(f"going on with the calibration that was begun {session.started}")
-            self.guide.say(f"  kept: {session.summary()}; a step is done anew by its own command")
+            self.guide.say(f"continuing the calibration that was started at {session.started}")
+            self.guide.say(
+                f"  already recorded: {session.summary()}; to repeat a step, run its own command"
+            )
         if session is None or not session.done(EMPTY):
             self.empty()
         if session is None or not covered(session, self.config.reference).enough:
@@ -162,7 +164,8 @@ class Procedure:
                 if not (self.recordings / f"{WALL}-{place}").is_dir():
                     return
             elif (asked or place > before) and not self.guide.another(
-                "A flat board at several distances makes the depths better. Show it (once more)?"
+                "A flat board at several distances improves the depth accuracy. Record it at one "
+                "more place?"
             ):
                 return
             self.guide.step(
@@ -207,8 +210,8 @@ class Procedure:
     def _remark_on_ghosts(self, session: Session) -> None:
         if not session.done(EMPTY):
             self.guide.say(
-                "the empty booth was not looked at: what is round in it may be taken for the ball "
-                "(station calibrate floor)"
+                "the empty booth has not been recorded: round objects in it may be taken for the "
+                "ball (run station calibrate floor)"
             )
 
     @contextmanager
@@ -234,9 +237,9 @@ class Procedure:
         radius_m = self.config.calibrate.ball_radius_m
         if session.radius_m != radius_m:
             raise CalibrationError(
-                f"the calibration that was begun {session.started} is with a ball of "
-                f"{session.radius_m:g} m and booth.toml says {radius_m:g} m "
-                "(calibrate.ball_radius_m); correct it, or begin anew with station calibrate --new"
+                f"the calibration that was started at {session.started} uses a ball with a radius "
+                f"of {session.radius_m:g} m, but booth.toml says {radius_m:g} m "
+                "(calibrate.ball_radius_m); correct it, or start again with station calibrate --new"
             )
 
 

@@ -99,7 +99,7 @@ class Session:
             started, radius_m = str(document["started"]), float(document["radius_m"])
         except (KeyError, TypeError, ValueError) as cause:
             raise FormatError(
-                f"{path} cannot be used ({cause}); begin anew with station calibrate --new"
+                f"{path} cannot be used ({cause}); start again with station calibrate --new"
             ) from None
         session = cls(folder, started, radius_m, sensors.cameras)
         session._replay_journal()
@@ -117,7 +117,7 @@ class Session:
             if then != now:
                 raise CalibrationError(
                     f"camera {name} is {now or 'not configured'} now and was {then or 'not there'} "
-                    f"when this calibration was begun ({self.started}); begin anew with "
+                    f"when this calibration was started ({self.started}); start again with "
                     "station calibrate --new"
                 )
 
@@ -236,7 +236,7 @@ class Session:
                 self._take(json.loads(line))
             except (ValueError, KeyError, TypeError, AttributeError, FormatError) as cause:
                 raise FormatError(
-                    f"{path}: line {number} cannot be read ({cause}); begin anew with "
+                    f"{path}: line {number} cannot be read ({cause}); start again with "
                     "station calibrate --new"
                 ) from None
 

@@ -53,7 +53,8 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
     guide.done(
         f"empty booth kept; the floor is seen by {seen}"
         if floors
-        else "empty booth kept; no camera sees the floor well, so the ball has to show it"
+        else "empty booth kept; no camera sees the floor well, so its position will be found from "
+        "the ball"
     )
 
 
@@ -214,7 +215,7 @@ def wave_ball(
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen: {counts}")
     for name, (near, moments) in coverage.links().items():
-        guide.say(f"{name} is tied to {near} by {moments} moments at which both saw it")
+        guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
     if not coverage.enough:
         guide.say(f"more would help: {coverage.advice()}")
 

@@ -69,7 +69,7 @@ def check_radius(balls: Sequence[BallDetection], radius_m: float) -> float:
     if abs(measured / radius_m - 1.0) > _RADIUS_SHARE:
         raise CalibrationError(
             f"the ball measures {1e3 * measured:.0f} mm in radius, but {1e3 * radius_m:.0f} mm was "
-            f"given: use the right ball, or correct calibrate.ball_radius_m; then begin anew with "
+            f"given: use the right ball, or correct calibrate.ball_radius_m; then start again with "
             f"station calibrate --new"
         )
     return measured
@@ -82,8 +82,8 @@ def check_rest(observations: Observations, front_cameras: Sequence[str]) -> None
         )
     if not observations.front and not front_cameras:
         raise CalibrationError(
-            "nothing says where the person faces: name the cameras in front (calibrate.front in "
-            "booth.toml), or run station calibrate mark --front"
+            "the direction that the person faces is not known: list the cameras in front "
+            "(calibrate.front in booth.toml), or run station calibrate mark --front"
         )
 
 
@@ -105,8 +105,8 @@ def check_pairs(
         shares = [float(pair.agree.mean()) for key, pair in pairs.items() if name in key]
         if shares and max(shares) < _AGREEING_SHARE:
             raise CalibrationError(
-                f"camera {name} agrees with the others in only {100 * max(shares):.0f} % of what "
-                "it saw: something else in its view is round; take it away and wave the ball again"
+                f"only {100 * max(shares):.0f} % of what camera {name} saw agrees with the other "
+                "cameras: another round object is in its view; remove it and wave the ball again"
             )
 
 
@@ -132,16 +132,18 @@ def check_scatter(state: State) -> None:
         scatter = float(np.sqrt(np.median(deviation) / MEDIAN)) if len(deviation) else 0.0
         if scatter > _LARGEST_SCATTER:
             raise CalibrationError(
-                f"camera {name} scatters {scatter:.1f} times as much as a sound sensor does: let "
-                "it warm up for 20 minutes, keep the sun out of the booth, or replace it"
+                f"the readings of camera {name} vary {scatter:.1f} times as much as those of a "
+                "normal sensor: let it warm up for 20 minutes, keep sunlight out of the booth, or "
+                "replace it"
             )
 
 
 def check_converged(state: State, largest_step: float = CONVERGED) -> None:
     if not state.last_step < largest_step:
         raise CalibrationError(
-            "the cameras contradict one another: a head or something else that is round may have "
-            "been taken for the ball; take it away, let no camera move, and wave the ball again"
+            "the cameras do not agree on where the ball was: a head or another round object may "
+            "have been taken for the ball; remove it, make sure that no camera moves, and wave the "
+            "ball again"
         )
 
 
@@ -157,9 +159,9 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         name = max(refused, key=lambda name: refused[name].rms_m)
         away_mm = 1e3 * float(np.linalg.norm(found[name].mean_m))
         raise CalibrationError(
-            f"camera {name} is off by {away_mm:.1f} mm ({1e3 * found[name].rms_m:.1f} mm rms) "
-            "where it was tested: make sure that no camera moves meanwhile, let the sensors warm "
-            "up, and wave the ball again"
+            f"in the test, camera {name} saw the ball {away_mm:.1f} mm away from where the others "
+            f"saw it ({1e3 * found[name].rms_m:.1f} mm rms): make sure that no camera moves while "
+            "the ball is waved, let the sensors warm up, and wave the ball again"
         )
 
 
@@ -179,9 +181,9 @@ def check_predicted(
         if not SIGMAS_95 * sigma_m <= limit_m:
             more = "" if covered.enough else f"; {covered.advice()}"
             raise CalibrationError(
-                f"by this calibration {what} could be wrong by "
-                f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, and "
-                f"{1e3 * limit_m:.0f} mm are allowed (calibrate.{what[:-1]}_limit_m): "
+                f"with this calibration, {what} could be wrong by up to "
+                f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, but the limit is "
+                f"{1e3 * limit_m:.0f} mm (calibrate.{what[:-1]}_limit_m): "
                 f"{remedy(stood)}{more}"
             )
 
@@ -189,8 +191,8 @@ def check_predicted(
 def check_slope(world_poses: WorldPoses) -> None:
     if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         raise CalibrationError(
-            "the floor's slope is known to "
-            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees only: {AROUND_WORDS}"
+            "the floor's slope is only known to within "
+            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {AROUND_WORDS}"
         )
 
 
@@ -198,8 +200,8 @@ def check_upright(world_poses: WorldPoses) -> None:
     for name, pose in world_poses.world_from_camera.items():
         if pose[2, 3] < 0.0:
             raise CalibrationError(
-                f"camera {name} comes out {-pose[2, 3]:.2f} m below the floor: what was taken for "
-                "the ball on the mark was something else; leave the booth, lay the ball on the "
+                f"camera {name} would be {-pose[2, 3]:.2f} m below the floor: another object was "
+                "taken for the ball on the mark; leave the booth, lay the ball on the "
                 "mark, and run station calibrate mark"
             )
 

@@ -74,18 +74,19 @@ class Solution:
             known = (
                 "reference"
                 if name == self.rig.reference
-                else f"known to {1e3 * shift_m:.1f} mm and {np.degrees(turn_rad):.2f} degrees"
+                else f"known to within {1e3 * shift_m:.1f} mm and "
+                f"{np.degrees(turn_rad):.2f} degrees"
             )
             off_mm = 1e3 * float(np.linalg.norm(one.mean_m))
             lines.append(f"{name}: {known}; off by {off_mm:.1f} mm in {one.detections} tests")
         if self.rig.predicted is not None:
             lines.append(
-                "from the calibration alone, heights are right to "
+                "from the calibration alone, heights are accurate to "
                 f"{2e3 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
                 f"{2e3 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
             )
         slope_deg = np.degrees(self.world_poses.slope_sigma_rad)
-        lines.append(f"the floor's slope is known to {slope_deg:.2f} degrees")
+        lines.append(f"the floor's slope is known to within {slope_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
 
     @property
@@ -161,14 +162,14 @@ def _solve(
     detections = sorted_detections(observations.balls, list(cameras), radius_m)
     refusals.check_rest(observations, front_cameras)
 
-    progress("relating pairs of cameras")
+    progress("finding the relative positions of the cameras")
     pairs = estimate_pairs({name: own.track for name, own in detections.items()})
     refusals.check_pairs(detections, pairs)
     poses = chain_poses(pairs, reference, list(cameras))
     refusals.check_connected(cameras, poses)
 
     problem = _problem(observations, cameras, detections, poses, radius_m, reference)
-    progress("solving without every fifth second")
+    progress("solving, with every fifth second kept for the test")
     training, tested, found = _tested(problem, poses)
 
     progress("solving with all that was seen")
@@ -263,7 +264,7 @@ def _problem(
         if spread < _MIN_SPREAD_M:
             raise CalibrationError(
                 "no camera saw enough of the floor, and the ball did not lie on it at three "
-                f"places away from one line: {refusals.AROUND_WORDS}"
+                f"places that form a triangle: {refusals.AROUND_WORDS}"
             )
     problem = Problem(
         cameras, reference, radius_m, waved, resting, surfaces, Widths.widest(cameras), heights_m
