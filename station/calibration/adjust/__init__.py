@@ -1,3 +1,4 @@
-"""The joint solution: what is unknown of cameras, sensors, ball and floor, and its adjustment.
-Pure mathematics: arrays in, the likeliest state and its covariance out; no verdict.
+"""The joint adjustment of all unknowns of cameras, sensors, ball and floor.
+Pure mathematics: arrays in, the most probable state and its covariance out. Whether the result is
+good enough is decided in `solve`.
 """

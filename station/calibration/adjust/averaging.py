@@ -1,11 +1,11 @@
-"""The average over all widths that the priors may have, each weighed by its evidence.
+"""Bayesian model averaging over the widths (standard deviations) of the priors.
 
 About a solution the squared deviations are quadratic, with information H and gradient b without the
 uncertain priors. For a prior with information L the marginal likelihood of the data is, by
 Laplace, log p = -(least of the quadratic) - log|H + L| / 2 + log|L| / 2 (MacKay 1992): the last two
-terms are Occam's factor, by which what is narrow is preferred unless the data speak against it.
-Means and covariances of all choices are averaged (Hoeting et al. 1999), so that what the evidence
-does not decide shows in the covariance.
+terms are Occam's factor, which favours narrow priors unless the data contradict them. Means and
+covariances of all choices are averaged with their evidence as weights (Hoeting et al. 1999), so
+that the covariance includes the uncertainty about the widths.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _UNLIKELY = 7.0
 
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
-    """The widths of the largest evidence, by the information and gradient of a state."""
+    """The widths with the largest evidence, from the information and gradient of a state."""
     fields = _fields(problem, state)
     best = max(fields, key=lambda field: field.best[1])
     return best.widths(best.best[0])
@@ -91,7 +91,7 @@ class _Base:
     information: Array
     gradient: Array
     values: Array
-    """(m,) by which unknowns are off what is believed."""
+    """(m,) deviations of the unknowns from their prior means."""
     groups: dict[str, list[Indices]]
     """Unknowns of each class, one group a camera, or a single one."""
     fields: list[Indices]
@@ -196,7 +196,7 @@ class _Field:
         step, covariance = np.zeros(size), np.zeros((size, size))
         step[self._inner] = mean
         step[self._outer] = self._outer_step + self._response @ mean
-        # What the inner unknowns leave open of the outer ones, and what those take from them.
+        # Covariance of the outer unknowns given the inner ones, plus the propagated one.
         carry = np.zeros((size, len(self._inner)))
         carry[self._inner] = np.eye(len(self._inner))
         carry[self._outer] = self._response
@@ -224,7 +224,7 @@ class _Field:
         )
 
     def _search(self, start: Choice | None) -> tuple[Choice, float]:
-        """The choice of the largest evidence, from the soundest and the widest of all."""
+        """The choice with the largest evidence, from the narrowest and the widest priors."""
         ends = [(0,) * len(CLASSES), (LEVELS - 1,) * len(CLASSES)]
         found = [self._climb(choice) for choice in (ends if start is None else [*ends, start])]
         return max(found, key=lambda one: one[1])

@@ -26,8 +26,7 @@ TREMOR_M = 2e-4
 """Standard deviation along each axis of a hand's tremor about a path that bends every tenth of a
 second."""
 ROUNDNESS = 3e-3
-"""Standard deviation of the ball's radius from one side to another, relative: what a ball made for
-play is off round."""
+"""Standard deviation of the radius of a play ball from one side to another, relative."""
 _NO_TRUST = 1e-9
 _HUBER = 3.0
 """Patches of a surface beyond so many standard deviations count less (Huber)."""
@@ -48,7 +47,7 @@ class BallEquations:
     theta_gradient: Array
 
     def summed(self) -> BallEquations:
-        """All detections as one: those of a ball that rests."""
+        """The sum over all detections, for a ball at rest."""
         return BallEquations(
             self.matrix.sum(axis=0)[None],
             self.gradient.sum(axis=0)[None],
@@ -58,7 +57,7 @@ class BallEquations:
         )
 
     def marginalised(self, radius_m: float, trust: Array) -> BallEquations:
-        """The equations once each detection has a tremor and a radius error of its own.
+        """The equations with a tremor and a radius error of each detection marginalised.
 
         The four nuisance parameters d with prior information L are eliminated: H becomes
         H - H (H + L)^-1 H, and so on. ``trust`` (n,) is what the equations were weighed by.
@@ -122,7 +121,7 @@ def corrected_centers(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, parameters: Array,
     radius_m: float,
 ) -> Array:  # fmt: skip
-    """Centres (n, 3) that each detection has by itself, given the sensor's parameters."""
+    """Centres (n, 3) of the detections, each estimated alone, with the sensor's corrections."""
     centers = seen.centers.copy()
     ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
     for _ in range(4):

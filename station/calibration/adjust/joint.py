@@ -18,9 +18,9 @@ _SETTLED = 0.1
 def solve_joint(
     problem: Problem, start: State, iterations: int = _ITERATIONS, *, informed: bool = True
 ) -> State:
-    """The most likely state and each detection's deviation; its information where wanted.
+    """The most likely state with each detection's deviation; with its information if ``informed``.
 
-    Where the measurements contradict one another so that none is found, the last step is infinite.
+    If the measurements are so inconsistent that there is no solution, ``last_step`` is infinite.
     """
     try:
         with np.errstate(over="raise", invalid="raise"):
@@ -39,7 +39,7 @@ def _settle(problem: Problem, start: State, iterations: int, informed: bool) -> 
         state = replace(state, controls=state.controls + path_step)
         if size < _SETTLED:
             break
-    # The detections tell how noisy they are, and nothing of priors and floors.
+    # The scale applies to the detections only, not to priors and floors.
     fitness = FitQuality.of(problem, state)
     state = replace(state, deviations=fitness.deviations, scale=fitness.scale, last_step=size)
     if informed:

@@ -43,11 +43,11 @@ CONTACT_M = 0.0005
 TAPE_M = 0.001
 """Standard deviation of a height that was measured with a tape."""
 _TAIL = 4.0
-"""Degrees of freedom (Student's t) of a contact that may be none."""
+"""Degrees of freedom (Student's t) of a contact: the ball may lie on something else."""
 
 
 class NormalEquations:
-    """The normal equations at a state, with the ball's noise so many times what is expected."""
+    """The normal equations at a state; ``scale`` is the ball's observed over its expected noise."""
 
     def __init__(self, problem: Problem, layout: Layout, state: State, scale: float = 1.0) -> None:
         self._problem, self._layout, self._state = problem, layout, state

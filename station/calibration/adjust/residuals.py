@@ -1,4 +1,4 @@
-"""Detections of the ball beside a state: their rows, their deviations, how far each counts."""
+"""Residuals of the ball detections at a state, their squared deviations and robust weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _NEAR_M = 0.05
 """Depth errors that are not corrected yet shift a ball along its ray, by less than that."""
 _BESIDE_M = 0.015
-"""A centre this little beside the detected one is where the equations are linear enough."""
+"""The equations are linear enough within this distance beside the detected centre."""
 _GATE = 11.3
 """Squared deviation of three numbers that one in a hundred exceeds; what is beyond counts less."""
 _REJECT = 60.0
@@ -34,7 +34,7 @@ MEDIAN = 2.366
 
 @dataclass(frozen=True, slots=True)
 class DetectionResiduals:
-    """One camera's detections (n) at a state."""
+    """Residuals and derivatives of one camera's n detections at a state."""
 
     centers: Array
     """(n, 3) of the ball, camera frame."""
@@ -137,9 +137,9 @@ def _near(centers: Array, detected: Array) -> Array:
 def _robust_weight(deviation: Array) -> Array:
     """Weights (n,) that leave out what deviates far more than most do.
 
-    As long as depth errors are not yet corrected all deviate, and none may be left out for that.
-    Once they are most deviate by less than the noise that is assumed: fingers over the ball then
-    show, although they deviate by no more than that noise could.
+    Deviations are relative to the typical one: before the depth errors are corrected, all
+    detections deviate and none may be left out for it. Afterwards most deviate by less than the
+    assumed noise, so that fingers over the ball stand out even within that noise.
     """
     typical = max(float(np.median(deviation)) / MEDIAN, _MIN_TYPICAL)
     deviation = deviation / typical

@@ -28,7 +28,7 @@ MIDDLE = 0.6
 """w0, 1/m: the middle of a booth's depths."""
 TOLERANCE = np.array([5e-3, np.inf, 1.5e-3, 2e-3, 2e-3])
 """Standard deviations of p0..p4 among sensors as they leave the factory; of the gain p1, and of the
-lens, `station.calibration.adjust.widths` tells."""
+lens, see `station.calibration.adjust.widths`."""
 TAIL = 4.0
 """Degrees of freedom (Student's t) of the polynomial's prior."""
 _COLUMNS, _ROWS = 9, 7
@@ -85,8 +85,8 @@ class SensorModel:
     def prior(self, parameters: Array, widths: Array, field_per_m: float) -> Array:
         """Prior information (U, U) at parameters (U,); ``widths`` (5,) of the classes.
 
-        The polynomial's prior has heavy tails (Student's t): a sensor that the data say is far off
-        is believed to be.
+        The polynomial's prior has heavy tails (Student's t), so that it hardly restrains a sensor
+        whose errors are large.
         """
         information = np.zeros((self.size, self.size))
         off = parameters[:POLYNOMIAL] / TOLERANCE

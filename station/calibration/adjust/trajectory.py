@@ -1,8 +1,8 @@
-"""The ball's way through the booth as a uniform cubic B-spline in time.
+"""The ball's path through the booth as a uniform cubic B-spline in time.
 
 Cameras run free, so no two see the ball at one moment. A continuous path (Furgale, Barfoot &
-Sibley 2012) lets each frame speak for its own time, and a camera's clock offset is a parameter like
-others.
+Sibley 2012) can be evaluated at the time of every frame, and a camera's clock offset is an
+ordinary parameter.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Widths of the priors of what may be wrong with a booth: narrow where nothing is, wide otherwise.
+"""Widths (standard deviations) of the priors of sensor, ball and floor errors.
 
-A class of departure is a gain, a lens parameter, a smooth depth field, the ball's radius, the
-floor's bow. Its standard deviation is unknown itself: one of a few levels from that of a sound
-unit to that of the worst that is in use. Which level holds is left to the data
+A class of errors is a gain, a lens parameter, a smooth depth field, the ball's radius, the
+floor's bow. Its standard deviation is unknown itself: one of a few levels from that of a good
+unit to that of the worst unit in use. The level is estimated from the data
 (`station.calibration.adjust.averaging`).
 """
 
@@ -66,7 +66,7 @@ class Widths:
 
     @classmethod
     def widest(cls, cameras: Iterable[str]) -> Widths:
-        """Widths that rule nothing out: to solve with before anything is known."""
+        """The widest priors, for a first solution."""
         worst = LEVELS - 1
         return cls(
             {name: (worst,) * len(SENSOR) for name in cameras},
@@ -83,7 +83,7 @@ class Widths:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """One answer to how wrong the units are in a class."""
+    """One assignment of levels to the cameras for a class, and its prior probability."""
 
     levels: tuple[int, ...]
     """Level of each camera; a single one of the ball or the floor."""
@@ -91,9 +91,9 @@ class Option:
 
 
 def options(name: str, cameras: int) -> tuple[Option, ...]:
-    """All answers of a class: at one level in all cameras, or wrong in one camera alone.
+    """All options of a class: one level for all cameras, or the widest level for one camera only.
 
-    The first is the sound one, the ``LEVELS``-th the widest in all cameras.
+    The first is the narrowest, the ``LEVELS``-th the widest in all cameras.
     """
     shares = (_SOUND, *([(1.0 - _SOUND) / (LEVELS - 1)] * (LEVELS - 1)))
     if name in (RADIUS, BOW):

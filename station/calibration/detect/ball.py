@@ -1,4 +1,4 @@
-"""Finding a ball of known radius in one depth image: its centre, and how sure that is.
+"""Finding a ball of known radius in one depth image: its centre and covariance.
 
 Coarse: pixels vote for its place (``ball_votes``). Fine: maximum likelihood over all pixels that
 see the ball at less than a limit of incidence, in inverse depth along each pixel's own ray. Which
@@ -119,7 +119,7 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
         return None
     ray = np.ascontiguousarray(rays(camera)[window])
     part = np.ascontiguousarray(inverse[window])
-    # The radius is free until the place is found: a ball of another size shall be told.
+    # The radius is free until the centre is found, so that a ball of another size is detected.
     for round_ in range(8):
         normal, pull, used, seen = normal_equations(part, ray, center, radius, gate, False)
         if used < _MIN_PIXELS:
@@ -179,7 +179,7 @@ def _window(camera: CameraCalibration, center: Array, reach_m: float) -> tuple[s
 
 
 def _is_ball(part: Image, ray: Image, center: Array, radius: float, used: int, seen: int) -> bool:
-    """Enough of it is seen, and around it one sees past it."""
+    """True if enough of it is visible and the surroundings are farther away than its rim."""
     if used < _MIN_VISIBLE * seen:
         return False
     ring, beyond = surroundings(part, ray, center, radius)

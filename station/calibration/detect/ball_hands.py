@@ -37,11 +37,11 @@ def hand_pixels(
     radius_m: float,
     gate: float,
 ) -> Mask:
-    """Pixels (h, w) that are not to speak for a ball, as fitted with a radius of its own.
+    """Mask (h, w) of pixels that may show a hand, to be left out of the fit of the ball.
 
-    ``radius_m`` is the ball's true radius, ``gate`` what a pixel's noise may be, 1/m. Fingers on a
-    distant ball are too narrow to be told from noise and once pulled its centre towards the hand by
-    0.7 mm, in frame after frame: there all is left out that a hand beside it may reach.
+    ``radius`` is the fitted radius, ``radius_m`` the true one, ``gate`` the largest noise of a
+    pixel, 1/m. Fingers on a distant ball are too narrow to be told from noise and have shifted its
+    centre by 0.7 mm in many frames: there all pixels within a hand's reach are left out.
     """
     off = _strays(part, ray, center, radius)
     if center[2] > _FINGERS_SHOW_M:

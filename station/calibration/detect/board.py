@@ -1,4 +1,4 @@
-"""A ChArUco board in infrared images: what it says of the lenses and of the calibration.
+"""Checks of the lenses and of a calibration with a ChArUco board in infrared images.
 
 Free intrinsics can give the same reprojection error as the factory's and yet put points centimetres
 off. So they are taken only when two halves of the views agree about them in millimetres where the

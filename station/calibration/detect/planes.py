@@ -1,7 +1,7 @@
 """Flat surfaces in one camera's averaged depth image: the floor, a board held up.
 
 In inverse depth a plane is linear in the pixel: 1/z = m . (x, y, 1) for the plane m . X = 1, so the
-mean over a cell of pixels is exact, and three pixels give a plane without more ado.
+mean over a cell of pixels is exact, and three pixels determine a plane.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _largest(ray: Array, inverse: Array, gate: float, axis: int) -> Array | None
             continue
         away = inverse - ray @ plane
         count = int(np.sum(np.abs(away) < gate))
-        # One cannot see through it: a plane that cuts across two walls has readings beyond it.
+        # A surface is opaque: a plane that cuts across two walls has readings beyond it.
         if count > most and np.sum(away < -gate) < _LARGEST_SHARE_BEYOND * count:
             best, most = plane, count
     if best is None:

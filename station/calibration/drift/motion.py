@@ -66,7 +66,8 @@ _SHADOW_CELLS = 2
 """The outline of a person, and of the shadow that the projector casts behind, in strides."""
 _MIN_SHARE = 0.15
 _COARSE_SIGMA_M, _FINE_SIGMA_M = 0.02, 0.2
-"""Directions that nothing shows must not wander: first by less than an outline can follow."""
+"""Prior standard deviations, for directions that the scene does not determine; the first keeps the
+move smaller than what outlines can follow."""
 _ITERATIONS = 10
 _HUBER, _TUKEY = 1.345, 4.685
 
@@ -299,8 +300,8 @@ def _align(
 def _weights(off: Array, convex: bool) -> Array:
     """Weights of deviations (in standard deviations): Huber's first, then Tukey's.
 
-    Few samples see some directions (the floor: up and down); what most of them call an outlier at
-    the start may be what they tell.
+    Some directions are determined by few samples (up and down, by the floor). At the start these
+    samples may look like outliers, and Tukey's weights would discard them.
     """
     if convex:
         return np.asarray(_HUBER / np.maximum(off, _HUBER))

@@ -1,5 +1,5 @@
-"""The cameras' frames for whoever calibrates or checks: the live ones of the running booth, or
-those of recordings replayed through the very same capture processes."""
+"""The cameras' frames for calibration and checks: live ones of the running booth, or recordings
+replayed through the same capture processes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class TimedFrame:
 
 
 class RecordedClock:
-    """The times of a recording's frames as they were on the day, whatever the pace of its replay.
+    """The original times of a recording's frames, independent of the speed of the replay.
 
     Four recordings are replayed by four processes that start one after the other and keep pace
     each by itself; what the frames have in common is written in the recordings.
@@ -218,9 +218,9 @@ class Feed:
         return taken
 
     def newest(self, timeout_s: float = 0.2) -> list[TimedFrame]:
-        """The newest frame of each camera since the last call: who looks is slower than they.
+        """The newest frame of each camera since the last call, for callers slower than the cameras.
 
-        Of a replay all frames: it gives the same result on a slow machine.
+        Of a replay all frames, so that the result does not depend on the machine's speed.
         """
         if self._clocks:
             return self.frames(timeout_s)

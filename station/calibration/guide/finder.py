@@ -14,7 +14,7 @@ from station.core.kinect_v1 import INDEPENDENT_HZ
 
 _THREADS = 2
 _WAITING = 6
-"""More frames than that do not wait: newer ones come."""
+"""Largest number of live frames in the queue; further ones are dropped."""
 _APART_S = 1.0 / INDEPENDENT_HZ
 _EARLY_S, _NEAR_S = 0.1 * _APART_S, 1.5 * _APART_S
 _RESET_S = 1.0
@@ -25,7 +25,7 @@ class BallFinder:
     """Finds the ball of a session in front of its empty booth. Use it in a ``with`` statement."""
 
     def __init__(self, session: Session, *, patient: bool) -> None:
-        """``patient``: no frame is left out for want of time."""
+        """``patient``: process every due frame, even if the search falls behind."""
         self._radius_m, self._cameras = session.radius_m, session.lensed_cameras()
         self._backgrounds = {
             name: view.depth_m()
@@ -44,14 +44,14 @@ class BallFinder:
         self._pool.shutdown(cancel_futures=True)
 
     def submit(self, frames: Iterable[TimedFrame]) -> None:
-        """Take frames to look at: of each camera so many a second as are worth it."""
+        """Queue frames for the search, at most ``INDEPENDENT_HZ`` per second of each camera."""
         for frame in frames:
             due_s = self._due_s.get(frame.camera, frame.time_s)
             late_s = frame.time_s - due_s
             if -_RESET_S < late_s < -_EARLY_S:
                 continue
             if self._patient or len(self._pending) < _WAITING:
-                # What is near the beat keeps it: of 30 frames a second 20 are looked at, not 15.
+                # Frames near their due time keep the schedule: of 30 a second 20 are used, not 15.
                 beat_s = due_s if abs(late_s) < _NEAR_S else frame.time_s
                 self._due_s[frame.camera] = beat_s + _APART_S
                 # A replay may be a minute ahead of the search: its frames wait on disk.

@@ -46,7 +46,7 @@ class HeldOut:
 
     @property
     def acceptable(self) -> bool:
-        """The mean is allowed what its own noise can be."""
+        """True if rms and mean are within limits; three sigmas are added to that of the mean."""
         allowed = LARGEST_MEAN_M + 3.0 * self.rms_m / np.sqrt(max(self.detections, 1))
         return self.rms_m < LARGEST_RMS_M and float(np.linalg.norm(self.mean_m)) < allowed
 

@@ -95,7 +95,8 @@ def small_jump(tracks: Mapping[str, Track]) -> ClockJump | None:
 def moved_camera(tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pair]) -> str | None:
     """A camera that agrees with the others before or after a moment, but not both.
 
-    Then it agrees with them in another way: one that took a head for the ball does not.
+    On the other side of that moment it must agree with them through another pose; a camera that
+    detected a head instead of the ball does not.
     """
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
     every = np.concatenate([pair.times_s for pair in pairs.values()])

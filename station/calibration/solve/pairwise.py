@@ -69,7 +69,7 @@ def match(a: Track, b: Track, shift_s: float = 0.0) -> tuple[Array, Array, Array
 
 
 def estimate_pair(a: Track, b: Track, seed: int = 0) -> Pair | None:
-    """The transform that most matches agree upon; None with too few matches."""
+    """Estimate the transform between two cameras by RANSAC; None with too few matches."""
     times, in_a, in_b = match(a, b)
     if len(times) < MIN_MATCHES:
         return None
@@ -96,7 +96,7 @@ def estimate_pair(a: Track, b: Track, seed: int = 0) -> Pair | None:
 
 
 def estimate_pairs(tracks: Mapping[str, Track]) -> dict[tuple[str, str], Pair]:
-    """Every pair of cameras that agree upon enough."""
+    """Estimates for all pairs of cameras with at least ``MIN_MATCHES`` consistent matches."""
     found = {}
     for a, b in combinations(tracks, 2):
         pair = estimate_pair(tracks[a], tracks[b])

@@ -28,7 +28,8 @@ _MIN_DETECTIONS = 60
 _AGREEING_SHARE = 0.5
 _LARGEST_SCATTER = 3.0
 CONVERGED, DIVERGED = 0.3, 10.0
-"""Last steps, in standard deviations: beyond the second nobody can tell whose fault it is."""
+"""Largest last steps, in standard deviations, of a final solution and of one whose further checks
+can still name the faulty camera."""
 _MARK_TOLERANCE_M = 0.008
 _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""

@@ -136,7 +136,7 @@ def solve(
     Raises:
         CalibrationError: naming the camera or the step that spoils it, and what to do.
     """
-    # The other core is used by whatever runs beside it, and more threads only wait for each other.
+    # One BLAS thread: other processes use the second core, and more threads wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         return _solve(
             observations, cameras, radius_m, reference, front_cameras, created, progress, limits
@@ -203,7 +203,7 @@ def _solve(
 def _tested(
     problem: Problem, poses: Mapping[str, Array]
 ) -> tuple[Problem, State, dict[str, HeldOut]]:
-    """The problem without the held-out seconds, its solution, and how that does in them."""
+    """The problem without the held-out seconds, its solution, and the test on these seconds."""
     training = acceptance.without_held_out(replace(problem, model=COARSE))
     coarse = solve_joint(training, first_state(training, poses), informed=False)
     refusals.check_converged(coarse, refusals.DIVERGED)
