@@ -275,7 +275,7 @@ def gather_frames(
         for frame in feed.frames():
             if len(taken[frame.camera]) < frames:
                 taken[frame.camera].append(frame)
-        progress(f"looking: {min(len(seen) for seen in taken.values())} of {frames} frames")
+        progress(f"{min(len(seen) for seen in taken.values())} of {frames} frames received")
     few = [name for name, seen in taken.items() if len(seen) < frames // 2]
     if few:
         raise CalibrationError(

@@ -76,7 +76,7 @@ class Guide:
         if not self.attended:
             return None
         answer = click.prompt(
-            "  A ball on a stand of measured height makes heights more certain. Height of its "
+            "  A ball on a stand of measured height makes heights more accurate. Height of its "
             "underside above the floor in metres (0: no stand)",
             type=_HEIGHT,
             default=0.0,

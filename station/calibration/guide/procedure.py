@@ -126,7 +126,7 @@ class Procedure:
                 if not (self.recordings / step).is_dir():
                     return
             elif place >= len(_AROUND) and (
-                asked or (place > before and not self.guide.another("Lay it at one more place?"))
+                asked or (place > before and not self.guide.another("Lay it at another place?"))
             ):
                 return
             where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"

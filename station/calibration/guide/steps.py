@@ -217,7 +217,7 @@ def wave_ball(
     for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
     if not coverage.enough:
-        guide.say(f"more would help: {coverage.advice()}")
+        guide.say(f"more positions would help: {coverage.advice()}")
 
 
 def _wave_line(coverage: Coverage, left_s: float) -> str:

@@ -153,7 +153,7 @@ def _solve(
     progress: Progress,
     limits: Limits,
 ) -> Solution:
-    progress("checking what was seen")
+    progress("checking the detections")
     covered = Coverage(cameras, reference)
     for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
         covered.add(ball)
@@ -172,7 +172,7 @@ def _solve(
     progress("solving, with every fifth second kept for the test")
     training, tested, found = _tested(problem, poses)
 
-    progress("solving with all that was seen")
+    progress("solving with all detections")
     try:
         problem = replace(problem, widths=most_probable_widths(training, tested))
         start = extended_state(problem, training, tested)

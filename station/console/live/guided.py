@@ -72,7 +72,7 @@ class PageGuide(Guide):
             return None
         self._say(
             "height",
-            text="A ball on a stand of measured height on the mark makes heights more certain. "
+            text="A ball on a stand of measured height on the mark makes heights more accurate. "
             "How high is its underside above the floor?",
         )
         answer = self._answer()
