@@ -34,6 +34,10 @@ else
 fi
 echo "installing Debian packages:$missing"
 export DEBIAN_FRONTEND=noninteractive
+# Another apt-get may hold the lock, as a fresh machine's own updates do.
+wait="-o DPkg::Lock::Timeout=300"
 # A failure is not the end: recordings are read without libfreenect, and tests say what they lack.
-{ $as_root apt-get update -qq && $as_root apt-get install -y -qq --no-install-recommends $missing; } \
-    >/dev/null || echo "note: apt-get could not install:$missing" >&2
+{
+    $as_root apt-get $wait update -qq || true
+    $as_root apt-get $wait install -y -qq --no-install-recommends $missing
+} >/dev/null || echo "note: apt-get could not install:$missing" >&2
