@@ -43,6 +43,17 @@ min_free_mb = 50
 [console]
 enabled = false
 """
+_WHOLE = """
+[spool]
+min_free_mb = 50
+[console]
+port = {port}
+[[deliver]]
+name = "shop"
+folder = "{handed}"
+"""
+_HANDED = "handed"
+"""Folder to which a whole booth hands its results over."""
 
 
 class Booth:
@@ -231,7 +242,7 @@ class Scans:
 
     def _take_away(self) -> None:
         """Move results away, as soon as they are there and handed over."""
-        handed = self._booth.folder / "handed"
+        handed = self._booth.folder / _HANDED
         while not self._open.wait(0.1):
             for result in list((self._booth.spool / "outbox").iterdir()):
                 if not handed.is_dir() or (handed / result.name).is_dir():
@@ -254,6 +265,15 @@ def running_booth(folder: Path, **options: Any) -> Iterator[tuple[Booth, Scans]]
         booth.close()
 
 
+@contextlib.contextmanager
+def whole_booth(folder: Path, **options: Any) -> Iterator[tuple[Booth, Scans]]:
+    """A booth with every process that a station can have: also console and hand-over."""
+    (folder / _HANDED).mkdir()
+    settings = _WHOLE.format(port=_free_port(), handed=_HANDED)
+    with running_booth(folder, settings=settings, **options) as whole:
+        yield whole
+
+
 def until(true: Callable[[], bool], limit_s: float = WAIT_S, pause_s: float = 0.02) -> float:
     """Seconds until something is true, or infinity."""
     began_s = time.monotonic()
@@ -264,7 +284,7 @@ def until(true: Callable[[], bool], limit_s: float = WAIT_S, pause_s: float = 0.
     return time.monotonic() - began_s
 
 
-def free_port() -> int:
+def _free_port() -> int:
     """A TCP port of this machine that nobody listens at."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))

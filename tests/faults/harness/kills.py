@@ -10,7 +10,7 @@ import threading
 import time
 from pathlib import Path
 
-from booth import Booth, Scans, free_port, running_booth, until
+from booth import Booth, Scans, until, whole_booth
 from table import Row, percentile
 
 _ISOLATED_S, _REPEATED_S = 3.0, 6.0
@@ -19,29 +19,19 @@ _APART_S = 10.0
 _AGAIN = 0.25
 """Share of the kills that hit the same process once more, as soon as it is back."""
 _MAX_WAITING = 3
-_SETTINGS = """
-[spool]
-min_free_mb = 50
-[console]
-port = {port}
-[[deliver]]
-name = "shop"
-folder = "handed"
-"""
 
 
 def kill_rows(kills: int, seed: int) -> list[Row]:
     """Kill so many processes of a booth with console and hand-over."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "handed").mkdir()
-        settings = _SETTINGS.format(port=free_port())
-        with running_booth(folder, settings=settings) as (booth, scans):
-            killed = _kill(booth, scans, kills, random.Random(seed))
-            # Each kill may rightly have cost its scan; nothing costs this one.
-            scans.take()
-            scans.settle()
-            rows = [scans.row(f"kill -9 at random moments, {kills} times")]
+    with (
+        tempfile.TemporaryDirectory() as name,
+        whole_booth(Path(name)) as (booth, scans),
+    ):
+        killed = _kill(booth, scans, kills, random.Random(seed))
+        # Each kill may rightly have cost its scan; nothing costs this one.
+        scans.take()
+        scans.settle()
+        rows = [scans.row(f"kill -9 at random moments, {kills} times")]
     for kind, limit_s in (("isolated", _ISOLATED_S), ("repeated", _REPEATED_S)):
         times = [back_s for of, back_s in killed if of == kind]
         if times:

@@ -8,34 +8,24 @@ import tempfile
 import time
 from pathlib import Path
 
-from booth import WAIT_S, Booth, free_port, running_booth, until
+from booth import WAIT_S, Booth, until, whole_booth
 from table import Row
 
 _NAMED_S, _REPLACED_S = 5.0, 15.0
 _GAP_S = 1.0
 """The longest time without a new frameset that counts as unharmed: reports are 0.25 s apart."""
-_SETTINGS = """
-[spool]
-min_free_mb = 50
-[console]
-port = {port}
-[[deliver]]
-name = "shop"
-folder = "handed"
-"""
 
 
 def stop_rows(only: tuple[str, ...] = ()) -> list[Row]:
     """Stop each process of a booth with console and hand-over, or only some."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "handed").mkdir()
-        settings = _SETTINGS.format(port=free_port())
-        with running_booth(folder, settings=settings) as (booth, scans):
-            rows = [_stop(booth, process) for process in only or booth.processes()]
-            scans.take()
-            scans.settle()
-            rows.append(scans.row("a scan after all of them"))
+    with (
+        tempfile.TemporaryDirectory() as name,
+        whole_booth(Path(name)) as (booth, scans),
+    ):
+        rows = [_stop(booth, process) for process in only or booth.processes()]
+        scans.take()
+        scans.settle()
+        rows.append(scans.row("a scan after all of them"))
     return rows
 
 
