@@ -1,14 +1,15 @@
-"""Scans one after the other: each is delivered, and no process grows."""
+"""Scans one after the other, seen on the console: each is delivered, and no process grows."""
 
 from __future__ import annotations
 
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
 import psutil
-from booth import Booth, running_booth
+from booth import Booth, whole_booth
 from table import Row
 
 _SLOPE_MB_H = 1.0
@@ -24,13 +25,14 @@ def soak_rows(scans_wanted: int, job: str) -> list[Row]:
     """Take so many scans, the next one as soon as the last one is accepted."""
     with (
         tempfile.TemporaryDirectory() as name,
-        running_booth(Path(name), job=job) as (booth, scans),
+        whole_booth(Path(name), job=job) as (booth, scans),
     ):
         began_s = time.monotonic()
         samples: list[tuple[float, dict[str, tuple[int, int]]]] = []
         for number in range(scans_wanted):
             scans.take()
             scans.settle(left=1)
+            _look_at_console(booth)
             if number % max(1, scans_wanted // _SAMPLES) == 0:
                 samples.append((time.monotonic() - began_s, _sizes(booth)))
             if number % _LOG_EVERY == 0:
@@ -59,6 +61,14 @@ def soak_rows(scans_wanted: int, job: str) -> list[Row]:
             slopes[worst] < _SLOPE_MB_H and opened <= _DESCRIPTORS,
         ),
     ]
+
+
+def _look_at_console(booth: Booth) -> None:
+    """The requests of a page that shows the booth and its history."""
+    for path in ("booth", "scans"):
+        url = f"http://127.0.0.1:{booth.config.console.port}/api/v1/{path}"
+        with urllib.request.urlopen(url, timeout=30.0) as answer:
+            answer.read()
 
 
 def _sizes(booth: Booth) -> dict[str, tuple[int, int]]:
