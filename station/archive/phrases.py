@@ -1,8 +1,9 @@
 """Sentences that the booth says of scans and cameras, in the reader's language. Pure.
 
 Processes speak English sentences, joined by "; ". They are put into Chinese where they are shown:
-the page and the printed sheet look them up in `phrases.json`, from sentences with {gaps} to
-Chinese ones with the same gaps. A test holds the table complete.
+the page and the printed sheet look them up in `phrases.json`, from sentences with gaps to Chinese
+ones with the same gaps. A {GAP} in capitals holds sentences of the table; any other {gap} holds a
+name or a number and stays as it is. A test holds the table complete.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def untranslated(text: str) -> list[str]:
         missing += (
             [piece]
             if found is None
-            else [m for gap in found[1].values() for m in untranslated(gap)]
+            else [m for name, gap in found[1].items() if name.isupper() for m in untranslated(gap)]
         )
     return missing
 
@@ -46,7 +47,12 @@ def _piece(text: str) -> str:
     if found is None:
         return text
     template, gaps = found
-    return template.format(**{name: in_language(value, "zh") for name, value in gaps.items()})
+    return template.format(
+        **{
+            name: in_language(value, "zh") if name.isupper() else value
+            for name, value in gaps.items()
+        }
+    )
 
 
 def _find(text: str) -> tuple[str, dict[str, str]] | None:

@@ -103,6 +103,10 @@ SPOKEN = [
     "station status",
     "the left hand does not match the scan (120 cm2 of it lie 33 mm away)",
     "what nobody ever said; scan again",
+    "with this calibration, heights could be wrong by up to 9.1 mm, but the limit is 5.0 mm "
+    "(calibrate.height_limit_m): wave the ball longer",
+    "camera front sends no frames; check its cable",
+    "there is no scan with the label head",
 ]
 
 
@@ -114,6 +118,16 @@ def test_sentences_are_said_in_chinese() -> None:
         "相机 a 没有图像（a 没有发送图像；正在重新打开）；"
     )
     assert in_language(SPOKEN[4], "zh") == "what nobody ever said；请重新扫描"
+    assert in_language(SPOKEN[5], "zh") == (
+        "按此校准，高度误差可达 9.1 毫米，而限值为 5.0 毫米"
+        "（calibrate.height_limit_m）：请多挥一会儿球"
+    )
+
+
+def test_names_stay_as_they_are() -> None:
+    """Also those that are words of the table."""
+    assert in_language(SPOKEN[6], "zh") == "相机 front 没有图像；请检查它的电缆"
+    assert in_language(SPOKEN[7], "zh") == "没有标签为 head 的扫描"
 
 
 def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:

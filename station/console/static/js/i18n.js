@@ -33,7 +33,10 @@ export function said(text) {
   return text.split(BETWEEN).map((piece) => {
     for (const [pattern, chinese] of phrases) {
       const found = pattern.exec(piece);
-      if (found) return chinese.replace(/\{(\w+)\}/g, (_, name) => said(found.groups[name]));
+      if (found) {
+        const filled = (name, value) => (name === name.toUpperCase() ? said(value) : value);
+        return chinese.replace(/\{(\w+)\}/g, (_, name) => filled(name, found.groups[name]));
+      }
     }
     return piece;
   }).join('；');
