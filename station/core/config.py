@@ -284,10 +284,12 @@ def load_config(path: Path) -> BoothConfig:
     """
     try:
         document = tomllib.loads(path.read_text())
+    except PermissionError:
+        raise ConfigError(f"{path} may not be read by you; run the command with sudo") from None
     except OSError as cause:
         raise ConfigError(
-            f"{path} cannot be read ({cause.strerror}); copy deploy/booth.example.toml there "
-            "or name another file with --config"
+            f"{path} cannot be read ({cause.strerror}); station setup writes it, --config names "
+            "another file"
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
         raise ConfigError(f"{path} is not TOML: {cause}") from None

@@ -127,6 +127,10 @@ class FreenectDriver:
         self._last_s = 0.0
 
     def open(self) -> DeviceInfo:
+        return self._open(sequence=0)
+
+    def _open(self, sequence: int) -> DeviceInfo:
+        """Open it; `sequence` is its first frame's number."""
         if self._recording is not None:
             try:
                 check_recording(self._recording)
@@ -141,7 +145,8 @@ class FreenectDriver:
         _declare(self._library)
         self._open_device(self._library)
         self._stop.clear()
-        self._failure, self._sequence, self._last_s = "", 0, time.monotonic()
+        # Before the first frame can come: the gap would count as lost frames.
+        self._failure, self._sequence, self._last_s = "", sequence, time.monotonic()
         self._pump = threading.Thread(target=self._run_events, name="freenect", daemon=True)
         self._pump.start()
         return kinect_v1(self._serial or f"replayed:{self._recording and self._recording.name}")
@@ -228,10 +233,8 @@ class FreenectDriver:
 
     def _play_again(self) -> None:
         """A recording at its end starts over, as a sensor whose clock was reset."""
-        sequence = self._sequence
         self.close()
-        self.open()
-        self._sequence = sequence
+        self._open(self._sequence)
 
     def close(self) -> None:
         self._stop.set()

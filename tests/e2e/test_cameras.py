@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -101,6 +102,26 @@ def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch, bo
     camera = FreenectCamera(name="a", recording=booth / "front-lower")
     with pytest.raises(DriverError, match=r"apt-get install libfreenect0\.5"):
         make_driver(camera).open()
+
+
+def test_a_recording_that_starts_over_loses_no_frames(booth: Path, tmp_path: Path) -> None:
+    """Its first frames may come before whoever reopened it goes on."""
+    recording = tmp_path / "short"
+    recording.mkdir()
+    names = (booth / "front-lower/INDEX.txt").read_text().splitlines()[:3]
+    (recording / "INDEX.txt").write_text("\n".join(names) + "\n")
+    for name in names:
+        shutil.copy(booth / "front-lower" / name, recording)
+    driver = FreenectDriver(FreenectCamera(name="a", recording=recording))
+    driver.open()
+    try:
+        sequences: list[int] = []
+        while len(sequences) < 60:
+            frame = driver.read(1.0)
+            sequences += [frame.sequence] if frame else []
+    finally:
+        driver.close()
+    assert sequences == list(range(60))
 
 
 def test_commands_without_a_station_end_with_the_remedy(booth: Path, tmp_path: Path) -> None:
