@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.administration.booth_file import CONFIG, STATE_FOLDER
+from station.administration.booth_file import CONFIG, STATE_FOLDER, VIRTUAL
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import fsync_folder, private_folder, publish_folder, read_json, write_json
@@ -24,7 +25,8 @@ VERSION = 1
 
 _DATABASE = ".sqlite"
 _JOURNAL_ENDS = (f"{_DATABASE}-wal", f"{_DATABASE}-shm")
-_JOURNALS = tuple(f"*{end}" for end in _JOURNAL_ENDS)
+_UNFINISHED = ".tmp"
+_MODE = 0o600
 _SCRATCH = ("tmp", "locks")
 """Folders of a spool that mean nothing without the processes that use them."""
 
@@ -45,7 +47,7 @@ def parts(config_path: Path, config: BoothConfig) -> list[Part]:
     names += [f"spool/{path.name}" for path in _entries(config.spool.folder)]
     if config_path == CONFIG:
         named = {config.calibration, config.calibrate.folder, config.spool.folder}
-        named.add(config.console.folder)
+        named |= {config.console.folder, STATE_FOLDER / VIRTUAL}
         named |= {
             camera.recording.parent
             for camera in config.cameras
@@ -169,26 +171,34 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _copy(source: Path, target: Path) -> None:
-    for path in (source, *source.rglob("*")):
+    """Copy a file or folder, readable only by its owner, without files that are being written."""
+    found = (source, *sorted(source.rglob("*")))
+    for path in found:
         if path.is_symlink():
             raise BoothError(f"{path} is a symbolic link; a backup contains plain files only")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if source.is_dir():
-        ignore = shutil.ignore_patterns(*_JOURNALS)
-        shutil.copytree(source, target, copy_function=_copy_file, ignore=ignore, dirs_exist_ok=True)
-    else:
-        _copy_file(source, target)
+    for path in found:
+        place = target / path.relative_to(source)
+        if path.is_dir():
+            private_folder(place)
+        elif not path.name.endswith((*_JOURNAL_ENDS, _UNFINISHED)):
+            private_folder(place.parent)
+            _copy_file(path, place)
 
 
-def _copy_file(source: Path | str, target: Path | str) -> None:
+def _copy_file(source: Path, target: Path) -> None:
     """Copy a file; a database is copied as of its last transaction, even while it is being
-    written."""
-    if not str(source).endswith(_DATABASE):
-        shutil.copy2(source, target)
-        return
-    with closing(sqlite3.connect(source)) as live, closing(sqlite3.connect(target)) as copy:
-        live.backup(copy)
-    shutil.copystat(source, target)
+    written.
+
+    Its mode is not copied: USB sticks have file systems that refuse to set one.
+    """
+    target.touch(_MODE)
+    if source.suffix == _DATABASE:
+        with closing(sqlite3.connect(source)) as live, closing(sqlite3.connect(target)) as copy:
+            live.backup(copy)
+    else:
+        shutil.copyfile(source, target)
+    written = source.stat()
+    os.utime(target, ns=(written.st_atime_ns, written.st_mtime_ns))
 
 
 def _remove(path: Path) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from station.core.errors import ConfigError
+from station.core.errors import BoothError, ConfigError
+from station.core.files import held
 from station.sensors.freenect import FreenectCamera
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -15,8 +17,20 @@ USUAL_NAMES = ("front-lower", "front-upper", "back-lower", "back-upper")
 
 CONFIG = Path("/etc/booth/booth.toml")
 STATE_FOLDER = Path("/var/lib/booth")
+VIRTUAL = "virtual"
 RUNTIME_FOLDER = Path("/run/booth")
-"""Places of an installed booth; the units name the same ones."""
+"""Places of an installed booth; the units name the same ones. The virtual booth's recordings, in
+the state folder, can be made anew."""
+
+
+def administration(config_path: Path) -> AbstractContextManager[None]:
+    """Only one command at a time sets up or restores a booth.
+
+    Raises:
+        BoothError: another one is at work.
+    """
+    busy = BoothError("another station setup or restore is at work; wait until it has ended")
+    return held(config_path.with_name(".administration.lock"), busy)
 
 
 def name_cameras(serials: Sequence[str], given: Sequence[str]) -> list[FreenectCamera]:

@@ -9,7 +9,7 @@ import click
 
 from station.administration import units
 from station.administration.archive import CONTENT, Part, check, part, restore_part
-from station.administration.booth_file import CONFIG, STATE_FOLDER
+from station.administration.booth_file import CONFIG, STATE_FOLDER, administration
 from station.administration.migrate import migrate
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.core.commands import config_option
@@ -37,7 +37,14 @@ def restore(backup: Path, config_path: Path | None) -> None:
         raise BoothError("the booth is running; first run: systemctl stop booth.target")
     if path == CONFIG and not is_installed_root():
         raise ConfigError(f"{path} belongs to root: run it with sudo, or give another --config")
-    backup = backup.resolve()
+    with administration(path):
+        names = _restore(backup.resolve(), path)
+    click.echo(f"{backup.resolve().name} is restored: {', '.join(names)}")
+    click.echo("next: station setup" if path == CONFIG else "next: station run")
+
+
+def _restore(backup: Path, path: Path) -> list[str]:
+    """Restore a backup to the booth of this booth.toml; returns the names of its parts."""
     names = check(backup)
     saved = load_config(backup / CONTENT / "booth.toml")
     for name in names:
@@ -52,8 +59,7 @@ def restore(backup: Path, config_path: Path | None) -> None:
         give_to_booth([STATE_FOLDER, config.spool.folder])
         _protect(path.parent)
         migrate(STATE_FOLDER)
-    click.echo(f"{backup.name} is restored: {', '.join(names)}")
-    click.echo("next: station setup" if path == CONFIG else "next: station run")
+    return names
 
 
 def _protect(folder: Path) -> None:

@@ -17,6 +17,8 @@ from station.administration import units
 from station.administration.booth_file import (
     CONFIG,
     STATE_FOLDER,
+    VIRTUAL,
+    administration,
     booth_toml,
     name_cameras,
     recorded_cameras,
@@ -76,9 +78,26 @@ def setup(
       station setup --virtual
     """
     path = find_config(config_path).resolve()
-    installed = path == CONFIG
-    if installed and not is_installed_root():
+    if path == CONFIG and not is_installed_root():
         raise ConfigError(f"{path} belongs to root: run it with sudo, or give another --config")
+    with administration(path):
+        left = _set_up(path, pairs, recordings, virtual=virtual, replace=replace, start=start)
+    click.echo("still to do:" if left else 'ready: station scan --label "Order 1234"')
+    for number, words in enumerate(left, 1):
+        click.echo(f"  {number}. {words}")
+
+
+def _set_up(
+    path: Path,
+    pairs: Sequence[str],
+    recordings: Path | None,
+    *,
+    virtual: bool,
+    replace: bool,
+    start: bool,
+) -> list[str]:
+    """Set up the booth that booth.toml at `path` describes; returns what is left to do."""
+    installed = path == CONFIG
     changed = replace or not path.exists()
     if changed:
         if virtual:
@@ -100,12 +119,14 @@ def setup(
         _take_calibration(recordings, config)
     if installed and config.console.enabled:
         _give_password(config)
+    streaming = True
     if start and installed and units.installed():
         units.start(afresh=changed)
         _wait_for_control()
         click.echo("the booth is running and will start with the machine")
-        subprocess.run([_COMMAND, "start"], check=False)
-    _say_what_is_left(config, installed=installed, started=start and installed)
+        streaming = subprocess.run([_COMMAND, "start"], check=False).returncode == 0
+    left = [] if streaming else ["remove the cause of the error above, then run: station start"]
+    return left + _what_is_left(config, installed=installed, started=start and installed)
 
 
 def _find(
@@ -145,7 +166,7 @@ def _write(path: Path, cameras: Sequence[FreenectCamera], *, installed: bool) ->
 
 
 def _virtual_folder(config_path: Path) -> Path:
-    return (STATE_FOLDER if config_path == CONFIG else config_path.parent) / "virtual"
+    return (STATE_FOLDER if config_path == CONFIG else config_path.parent) / VIRTUAL
 
 
 def _recording_folder(camera: CameraConfig) -> Path | None:
@@ -223,8 +244,8 @@ def compare_sensors(named: Sequence[str], connected: Sequence[str]) -> list[str]
     return left
 
 
-def _say_what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> None:
-    left = []
+def _what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> list[str]:
+    left: list[str] = []
     physical = [c.serial for c in config.cameras if isinstance(c, FreenectCamera) and c.serial]
     if physical:
         left += compare_sensors(physical, serial_numbers())
@@ -241,6 +262,4 @@ def _say_what_is_left(config: BoothConfig, *, installed: bool, started: bool) ->
         left.append("station calibrate")
     if not started:
         left.append("systemctl enable --now booth.target" if installed else "station run")
-    click.echo("still to do:" if left else 'ready: station scan --label "Order 1234"')
-    for number, words in enumerate(left, 1):
-        click.echo(f"  {number}. {words}")
+    return left

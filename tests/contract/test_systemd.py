@@ -53,6 +53,18 @@ def test_a_service_comes_back_whatever_happens(path: Path) -> None:
         assert int(unit["Service"]["MemoryMax"][:-1]) > 0
 
 
+def test_pauses_are_written_as_sleep_reads_them() -> None:
+    """systemd's "20min" ended the drift check before it began."""
+    pauses = [
+        pause
+        for path in SERVICES
+        for pause in re.findall(r"^Exec\w+=sleep (.*)$", path.read_text(), re.MULTILINE)
+    ]
+    assert pauses
+    for pause in pauses:
+        assert re.fullmatch(r"\d+[smh]?", pause)
+
+
 def test_the_target_wants_units_that_exist() -> None:
     wanted = [
         name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -12,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from station.administration.archive import parts, save
-from station.administration.booth_file import booth_toml, name_cameras
+from station.administration.booth_file import administration, booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
 from station.administration.migrate import migrate
 from station.administration.restore import restore
@@ -58,6 +59,14 @@ def test_setup_writes_a_booth_and_keeps_it(tmp_path: Path) -> None:
     _run(setup, "--config", config, "--recordings", recordings, "--replace")
     assert load_config(config).workers.count == 1
     assert config.with_name("booth.toml.old").read_bytes() == before
+
+
+def test_one_setup_at_a_time(tmp_path: Path) -> None:
+    config, recordings = tmp_path / "booth.toml", _recordings(tmp_path / "recordings")
+    with administration(config), pytest.raises(BoothError, match="another station setup"):
+        _run(setup, "--config", config, "--recordings", recordings)
+    assert not config.exists()
+    _run(setup, "--config", config, "--recordings", recordings)
 
 
 def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
@@ -165,6 +174,23 @@ def test_what_was_saved_comes_back_on_another_machine(
     other = tmp_path / "other/booth.toml"
     _run(restore, saved, "--config", other)
     assert _content(other.parent) == expected
+
+
+def test_a_disk_without_file_modes_takes_a_backup(
+    booth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As FAT and exFAT, which USB sticks come with."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "chmod", refuse)
+    saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=True)
+    other = tmp_path / "other/booth.toml"
+    _run(restore, saved, "--config", other)
+    mesh = other.parent / "spool/outbox/scan-1/mesh.ply"
+    assert mesh.read_bytes() == b"spool/outbox/scan-1/mesh.ply"
+    assert mesh.stat().st_mode & 0o077 == mesh.parent.stat().st_mode & 0o077 == 0
 
 
 def test_restoring_keeps_what_it_replaces(booth: Path, tmp_path: Path) -> None:
