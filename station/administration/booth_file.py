@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from station.core.drivers import plain_name
 from station.core.errors import BoothError, ConfigError
 from station.core.files import held
 from station.sensors.freenect import FreenectCamera
 
-_NAME = re.compile(r"[A-Za-z0-9_-]+")
 USUAL_NAMES = ("front-lower", "front-upper", "back-lower", "back-upper")
 
 
@@ -46,8 +45,7 @@ def name_cameras(serials: Sequence[str], given: Sequence[str]) -> list[FreenectC
         if not separator or serial not in serials:
             known = ", ".join(serials) or "none"
             raise ConfigError(f"--camera {words}: give NAME=SERIAL; connected sensors: {known}")
-        if not _NAME.fullmatch(name):
-            raise ConfigError(f"--camera {words}: a name has letters, digits, '-' and '_' only")
+        _check_name(name, f"--camera {words}")
         if serial in pairs or name in pairs.values():
             raise ConfigError(f"--camera {words}: this name or this sensor is given twice")
         pairs[serial] = name
@@ -62,12 +60,21 @@ def recorded_cameras(folder: Path) -> list[FreenectCamera]:
     """One camera for each recording in a folder, named as the recording is.
 
     Raises:
-        ConfigError: there are no recordings.
+        ConfigError: there are no recordings, or the name of one cannot be a camera's.
     """
     found = sorted(index.parent for index in folder.resolve().glob("*/INDEX.txt"))
     if not found:
         raise ConfigError(f"{folder} holds no recordings (folders with INDEX.txt)")
+    for path in found:
+        _check_name(path.name, str(path))
     return [FreenectCamera(name=path.name, driver="freenect", recording=path) for path in found]
+
+
+def _check_name(name: str, origin: str) -> None:
+    try:
+        plain_name(name)
+    except ValueError as cause:
+        raise ConfigError(f"{origin}: {cause}") from None
 
 
 def booth_toml(cameras: Sequence[FreenectCamera], *, installed: bool) -> str:

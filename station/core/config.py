@@ -292,7 +292,9 @@ def load_config(path: Path) -> BoothConfig:
             "another file"
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
-        raise ConfigError(f"{path} is not TOML: {cause}") from None
+        raise ConfigError(
+            f"{path} is not TOML: {cause}; correct it, or station setup --replace writes a new one"
+        ) from None
     base = {BASE_FOLDER: path.resolve().parent}
     try:
         cameras = document.get("cameras")

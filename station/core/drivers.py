@@ -8,6 +8,7 @@ of `CameraConfig`. No other place lists the drivers.
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,9 +22,21 @@ BASE_FOLDER = "base_folder"
 """Key of the validation context: the folder that relative paths are relative to."""
 
 
-def _plain_name(name: str) -> str:
-    if not name or not all(c.isalnum() or c in "-_" for c in name) or not name.isascii():
-        raise ValueError("use letters, digits, '-' and '_' only")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,39}")
+"""A name is a word of commands, where "-x" would be an option, and a part of sockets' file names,
+which have at most 107 characters."""
+
+
+def plain_name(name: str) -> str:
+    """The name, if a camera may have it.
+
+    Raises:
+        ValueError: what is allowed.
+    """
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            "use 1 to 40 letters, digits, '-' and '_' for a name, which does not begin with '-'"
+        )
     return name
 
 
@@ -32,7 +45,7 @@ def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
     return path if base is None else base / path
 
 
-Name = Annotated[str, AfterValidator(_plain_name)]
+Name = Annotated[str, AfterValidator(plain_name)]
 ConfigPath = Annotated[Path, AfterValidator(_beside_the_file)]
 """A path in the configuration: a relative one is relative to the configuration file."""
 

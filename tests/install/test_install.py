@@ -216,18 +216,19 @@ def test_upgrade_and_downgrade_keep_what_the_shop_has(
     _scan(machine, "after an upgrade")
 
 
-def test_an_unknown_layout_is_refused_and_the_booth_goes_on(
-    machine: Machine, package_before: Path
+@pytest.mark.parametrize("name", ["state.json", "calibration.json"])
+def test_an_unknown_format_is_refused_and_the_booth_goes_on(
+    machine: Machine, package_before: Path, name: str
 ) -> None:
     """An older package once would have met files that it cannot read."""
-    state = machine.root / STATE.lstrip("/") / "state.json"
-    known = state.read_text()
-    state.write_text('{"format": "booth-state", "version": 99}\n')
+    path = machine.root / STATE.lstrip("/") / name
+    known = path.read_text()
+    path.write_text(re.sub('"version": 1', '"version": 99', known, count=1))
     install = ("apt-get", "install", "-y", "--allow-downgrades", f"/root/{package_before.name}")
     refused = machine.run(*install, check=False)
-    state.write_text(known)
+    path.write_text(known)
     assert refused.returncode != 0
-    assert "has version 99" in refused.stdout + refused.stderr
+    assert f"{name} has version 99" in refused.stdout + refused.stderr
     _ready(machine)
     _scan(machine, "after a refused downgrade")
 

@@ -15,9 +15,10 @@ from click.testing import CliRunner
 from station.administration.archive import parts, save
 from station.administration.booth_file import administration, booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
-from station.administration.migrate import migrate
+from station.administration.migrate import MIGRATIONS, VERSION, migrate
 from station.administration.restore import restore
 from station.administration.setup import compare_sensors, setup
+from station.core import bundle, rig
 from station.core.config import load_config
 from station.core.errors import BoothError, ConfigError, FormatError
 from station.core.rig import Rig
@@ -73,6 +74,13 @@ def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds no recordings"):
         _run(setup, "--config", tmp_path / "booth.toml", "--recordings", tmp_path)
     assert not (tmp_path / "booth.toml").exists()
+
+
+def test_setup_takes_no_recording_whose_name_no_camera_can_have(tmp_path: Path) -> None:
+    recordings = _recordings(tmp_path / "recordings")
+    (recordings / "back-upper").rename(recordings / "back upper")
+    with pytest.raises(ConfigError, match="back upper: use 1 to 40 letters"):
+        _run(setup, "--config", tmp_path / "booth.toml", "--recordings", recordings)
 
 
 def test_a_virtual_booth_is_set_up_and_comes_back_without_its_recordings(tmp_path: Path) -> None:
@@ -297,10 +305,13 @@ def test_a_layout_that_is_not_known_is_refused(tmp_path: Path, version: object) 
     assert path.read_bytes() == before
 
 
-def test_the_package_refuses_what_its_migrations_do_not_read() -> None:
+def test_the_package_refuses_what_its_programs_do_not_read() -> None:
     """preinst is a shell script that runs before the package's own code is there."""
-    from station.administration.migrate import MIGRATIONS, VERSION
-
-    script = Path(__file__).parents[2] / "deploy/package/body-booth/preinst"
-    known = " ".join(map(str, sorted({*MIGRATIONS, VERSION})))
-    assert f'known_state="{known}"' in script.read_text()
+    script = (Path(__file__).parents[2] / "deploy/package/body-booth/preinst").read_text()
+    read = {
+        "state": {*MIGRATIONS, VERSION},
+        "calibration": rig.VERSIONS,
+        "bundle": bundle.VERSIONS,
+    }
+    for name, versions in read.items():
+        assert f'known_{name}="{" ".join(map(str, sorted(versions)))}"' in script

@@ -45,6 +45,8 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         (_CAMERA + _CAMERA, "the camera name front is used twice"),
         (_CAMERA + "[calibrate]\nball_radius_m = 0.06", "not found reliably beyond 2.4 m"),
         (_CAMERA.replace("front", "../front", 1), "letters, digits"),
+        (_CAMERA.replace("front", "-front", 1), "does not begin with '-'"),
+        (_CAMERA.replace("front", 41 * "a", 1), "1 to 40 letters"),
         (
             _CAMERA.replace('"recorded"', '"kinect9"'),
             "no driver 'kinect9'; installed: freenect, recorded, virtual",
@@ -63,8 +65,8 @@ def test_an_impossible_value_names_the_file_and_the_key(
     assert "\n" not in str(raised.value)
 
 
-def test_a_missing_file_says_where_an_example_is(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"deploy/booth\.example\.toml"):
+def test_a_missing_file_says_what_writes_one(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"station setup"):
         load_config(tmp_path / "booth.toml")
 
 
