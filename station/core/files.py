@@ -86,6 +86,20 @@ def is_held(path: Path) -> bool:
     return False
 
 
+def entries_of(folder: Path) -> list[Path]:
+    """Contents of a folder, sorted; nothing if there is no such folder.
+
+    Unlike `Path.glob`, which takes a folder that it may not read for an empty one.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except FileNotFoundError:
+        return []
+
+
 def read_regular(path: Path, most_bytes: int) -> bytes:
     """The content of a regular file: no link is followed, no device or pipe is read.
 
@@ -180,6 +194,10 @@ def read_json(
     return dict(document)
 
 
+def _raise(error: OSError) -> None:
+    raise error
+
+
 def publish_folder(temporary: Path, final: Path) -> None:
     """Give a finished folder its final name: fsync everything in it, rename, fsync the parent.
 
@@ -187,10 +205,11 @@ def publish_folder(temporary: Path, final: Path) -> None:
 
     Raises:
         FileExistsError: ``final`` is there already.
+        OSError: the disk refused.
     """
     if final.exists():
         raise FileExistsError(f"{final} exists already")
-    for root, _, names in os.walk(temporary):
+    for root, _, names in os.walk(temporary, onerror=_raise):
         for name in names:
             fsync_file(Path(root) / name)
         fsync_folder(Path(root))

@@ -36,7 +36,13 @@ from pathlib import Path
 from typing import Any, Literal, NewType, get_args
 
 from station.core.errors import InputError, SpoolError
-from station.core.files import private_folder, publish_folder, read_bounded_json, write_json
+from station.core.files import (
+    entries_of,
+    private_folder,
+    publish_folder,
+    read_bounded_json,
+    write_json,
+)
 
 ScanId = NewType("ScanId", str)
 """A scan's id: 1 to 64 letters, digits, '-' and '_'. It names folders, so nothing else may."""
@@ -140,7 +146,7 @@ class Notes:
 
     def ids(self) -> list[ScanId]:
         """The ids of all scans that have a note."""
-        names = (entry.stem for entry in self.folder.glob("*.json"))
+        names = (path.stem for path in entries_of(self.folder) if path.suffix == ".json")
         return sorted(ScanId(name) for name in names if is_scan_id(name))
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import logging
+import errno
+import os
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +40,7 @@ def store(tmp_path: Path) -> CalibrationStore:
 
 
 def test_another_calibration_brings_its_own_empty_booth(store: CalibrationStore) -> None:
-    watch = DriftWatch(store, logging.getLogger())
+    watch = DriftWatch(store)
     store.use("20261101T100000Z")
     [move] = watch.moves(CAMERA, _frames(20000), 1e-4)
     assert not move.moved
@@ -52,19 +55,56 @@ def test_another_calibration_brings_its_own_empty_booth(store: CalibrationStore)
 
 def test_images_of_another_size_are_refused(store: CalibrationStore) -> None:
     store.use("20261101T100000Z")
-    watch = DriftWatch(store, logging.getLogger())
+    watch = DriftWatch(store)
     with pytest.raises(CalibrationError, match="camera front-lower gives images of 320 x 240"):
         watch.moves(CAMERA, [frame[::2, ::2] for frame in _frames(20000)], 1e-4)
 
 
-def test_a_torn_scene_is_told_and_scans_go_on(
-    store: CalibrationStore, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_torn_scene_refuses_scans_until_it_is_whole(store: CalibrationStore) -> None:
     store.use("20261101T100000Z")
     path = store.folder / "20261101T100000Z/scene/front-lower.npz"
+    whole = path.read_bytes()
     path.write_bytes(b"torn")
-    watch = DriftWatch(store, logging.getLogger())
-    assert watch.moves(CAMERA, _frames(20000), 1e-4) == []
-    assert "front-lower.npz cannot be read" in caplog.text
+    watch = DriftWatch(store)
+    for _ in range(2):
+        with pytest.raises(
+            CalibrationError, match=r"checked for moved .*front-lower.npz cannot be read"
+        ):
+            watch.moves(CAMERA, _frames(20000), 1e-4)
+    path.write_bytes(whole)
+    assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EACCES])
+@pytest.mark.parametrize("place", ["", "20261101T100000Z", "20261101T100000Z/scene"])
+def test_a_folder_that_cannot_be_read_is_not_taken_for_an_empty_one(
+    store: CalibrationStore, monkeypatch: pytest.MonkeyPatch, code: int, place: str
+) -> None:
+    store.use("20261101T100000Z")
+    watch = DriftWatch(store)
+    with monkeypatch.context() as disk:
+        _break(disk, store.folder / place, code)
+        with pytest.raises(CalibrationError, match="could not be checked for moved cameras"):
+            watch.moves(CAMERA, _frames(20000), 1e-4)
+    assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+
+
+def _break(disk: pytest.MonkeyPatch, folder: Path, code: int) -> None:
+    """Let every look into a folder, or at what is in it, fail."""
+
+    def failing(whole: Callable[..., Any]) -> Callable[..., Any]:
+        def call(path: Any, *rest: Any, **options: Any) -> Any:
+            if isinstance(path, str | Path) and folder in (Path(path), Path(path).parent):
+                raise OSError(code, os.strerror(code), str(path))
+            return whole(path, *rest, **options)
+
+        return call
+
+    for name in ("listdir", "scandir", "stat"):
+        disk.setattr(os, name, failing(getattr(os, name)))
+
+
+def test_without_a_stored_scene_there_is_nothing_to_check(store: CalibrationStore) -> None:
+    store.use("20261101T100000Z")
     shutil.rmtree(store.folder)
-    assert DriftWatch(store, logging.getLogger()).moves(CAMERA, _frames(20000), 1e-4) == []
+    assert DriftWatch(store).moves(CAMERA, _frames(20000), 1e-4) == []

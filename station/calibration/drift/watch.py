@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,8 +17,8 @@ from station.core.rig import CameraCalibration
 class DriftWatch:
     """The check against the calibration in use; it reloads when another is put into use."""
 
-    def __init__(self, store: CalibrationStore, log: logging.Logger) -> None:
-        self._store, self._log = store, log
+    def __init__(self, store: CalibrationStore) -> None:
+        self._store = store
         self._content = b""
         self._views: Mapping[str, StaticView] = {}
         self._references: dict[str, DriftReference] = {}
@@ -30,7 +29,8 @@ class DriftWatch:
         """The camera's displacement from frames of one moment; empty where nothing was stored.
 
         Raises:
-            CalibrationError: the camera's images are of another size than when it was calibrated.
+            CalibrationError: the calibration's empty booth cannot be read, or the camera's images
+                are of another size than when it was calibrated.
         """
         self._follow()
         view = self._views.get(camera.name)
@@ -51,8 +51,11 @@ class DriftWatch:
             content = self._store.in_use.read_bytes()
             if content == self._content:
                 return
-            self._references, self._views = {}, {}
+            self._references, self._views, self._content = {}, {}, b""
             self._views = self._store.scene()
             self._content = content
         except (BoothError, OSError) as error:
-            self._log.warning("scans are not checked for moved cameras: %s", error)
+            raise CalibrationError(
+                f"this scan could not be checked for moved cameras ({error}); scan again; if it "
+                "happens again, run station calibrate"
+            ) from None

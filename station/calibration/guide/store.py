@@ -19,6 +19,7 @@ from station.calibration.detect.scene import StaticView
 from station.calibration.guide.session import SCENE
 from station.core.errors import CalibrationError
 from station.core.files import (
+    entries_of,
     fsync_folder,
     held,
     private_folder,
@@ -83,9 +84,10 @@ class CalibrationStore:
 
     def _folders(self) -> list[Path]:
         return [
-            path.parent
-            for path in sorted(self.folder.glob(f"*/{CALIBRATION}"))
-            if not path.parent.name.startswith((UNFINISHED, _ABANDONED, "."))
+            folder
+            for folder in entries_of(self.folder)
+            if not folder.name.startswith((UNFINISHED, _ABANDONED, "."))
+            and (folder / CALIBRATION).exists()
         ]
 
     def _is_used(self, folder: Path) -> bool:
@@ -154,10 +156,11 @@ class CalibrationStore:
 
         Raises:
             FormatError: naming the file that cannot be read.
+            OSError: a folder cannot be read.
         """
         for folder in self._folders():
             if self._is_used(folder):
-                views = sorted((folder / SCENE).glob("*.npz"))
+                views = [path for path in entries_of(folder / SCENE) if path.suffix == ".npz"]
                 return {path.stem: StaticView.load(path) for path in views}
         return {}
 
