@@ -255,7 +255,7 @@ def _what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> lis
                 "its own"
             )
         left.append(
-            "cover one lens after another and check in `station status` that the right camera "
+            "unplug one camera after another and check in `station status` that the right one "
             "goes silent; if not, run station setup --replace --camera NAME=SERIAL"
         )
     if not config.calibration.exists():

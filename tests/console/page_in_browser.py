@@ -7,6 +7,7 @@ Pictures of every view go to the folder that CONSOLE_PICTURES names.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -35,6 +36,9 @@ _NOTE_REMEDY = """() => {
     if (!shown.hidden) window.remedy ??= { text: shown.textContent, at_ms: Date.now() };
   }).observe(shown, { attributes: true, childList: true });
 }"""
+_ENGLISH = re.compile(r"(?<![\w-])[A-Za-z]{3,}(?![\w-])")
+_NAMES = ("Order", "script", "alert", "rms")
+"""Words of the tests' labels, and one that stays."""
 _REMEDY_S = 2.0
 """Bar: so soon after a camera ended the operator reads what to do."""
 
@@ -310,7 +314,26 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
     expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
     _picture(page, "result-zh")
+    compare = "/".join(scan["scan_id"] for scan in scans[:2])
+    for view, shown in (
+        ("scan", "#go:enabled"),
+        ("booth", "[data-camera][data-state=streaming]"),
+        ("history", "tr[data-scan]"),
+        (f"compare/{compare}", "canvas[data-ready=yes]"),
+        ("calibration", "#calibrate"),
+    ):
+        open_view(page, console, view)
+        expect(page.locator(shown).first).to_be_visible(timeout=LONG_MS)
+        _picture(page, f"{view.partition('/')[0]}-zh")
+        words = page.locator("main").inner_text()
+        assert [word for word in _ENGLISH.findall(words) if word not in _NAMES] == [], view
+    page.goto(f"{console.url}/person")
+    expect(page.locator("svg")).to_be_visible()
+    _picture(page, "person-zh")
+    assert _ENGLISH.findall(page.locator("body").inner_text()) == []
+    page.goto(console.url)
     page.select_option("#language", "en")
+    open_view(page, console, f"result/{scans[0]['scan_id']}")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("Waist", timeout=20_000)
 
 

@@ -48,6 +48,16 @@ def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:
         vault.set_password("short")
 
 
+def test_a_password_of_any_script(vault: Vault) -> None:
+    """One keyboard sends an accented letter, the other a letter and an accent."""
+    vault.set_password("Caf\u00e9 \u6d4b\u91cf \U0001f4cf")
+    assert vault.check_password("Cafe\u0301 \u6d4b\u91cf \U0001f4cf")
+    assert not vault.check_password("Cafe \u6d4b\u91cf \U0001f4cf")
+    assert not vault.check_password("\udcff" * 12)
+    with pytest.raises(BoothError, match="not UTF-8"):
+        vault.set_password("\udcff" * 12)
+
+
 def test_tokens_expire_and_are_revoked(vault: Vault) -> None:
     gone = vault.make_token("gone", ("read",), 0.0)
     kept = vault.make_token("kept", ("scan", "read"), 1.0)

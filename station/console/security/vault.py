@@ -13,6 +13,7 @@ import secrets
 import sqlite3
 import threading
 import time
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +89,7 @@ class Vault:
         """
         if len(password) < SHORTEST_PASSWORD:
             raise BoothError(f"the password needs {SHORTEST_PASSWORD} characters or more")
-        write_bytes(self._folder / PASSWORD, self._hasher.hash(password).encode())
+        write_bytes(self._folder / PASSWORD, self._hasher.hash(_composed(password)).encode())
         (self._folder / PASSWORD).chmod(0o600)
         self._run("DELETE FROM sessions")
 
@@ -96,8 +97,8 @@ class Vault:
         """Whether it is the operator's; takes tens of milliseconds in either case."""
         try:
             stored = (self._folder / PASSWORD).read_text()
-            return self._hasher.verify(stored, password)
-        except (OSError, VerificationError, InvalidHashError):
+            return self._hasher.verify(stored, _composed(password))
+        except (OSError, BoothError, VerificationError, InvalidHashError):
             return False
 
     def open_session(self, hours: float) -> str:
@@ -182,6 +183,20 @@ def _token(row: tuple[object, ...]) -> Token:
     return Token(
         str(name), granted, float(str(made)), None if expires is None else float(str(expires))
     )
+
+
+def _composed(password: str) -> bytes:
+    """UTF-8 of a password; keyboards differ in how they spell an accented letter.
+
+    RFC 8265 (OpaqueString) prescribes NFC.
+
+    Raises:
+        BoothError: it holds what is no character.
+    """
+    try:
+        return unicodedata.normalize("NFC", password).encode()
+    except UnicodeEncodeError:
+        raise BoothError("the password holds bytes that are not UTF-8; type another one") from None
 
 
 def _hash(secret: str) -> str:

@@ -15,7 +15,8 @@ export function login(main, done) {
       wrong.hidden = false;
       password.select();
     }
-  } }, h('label', { htmlFor: 'password' }, t('login.password')), password, wrong, h('button', { className: 'primary', id: 'login' }, t('login.go')));
+  } }, h('label', { htmlFor: 'password' }, t('login.password')), password, wrong, h('button', { className: 'primary', id: 'login' }, t('login.go')),
+    h('p', { className: 'small soft' }, t('login.forgotten')));
   main.replaceChildren(h('div', { className: 'login card' }, h('h1', {}, t('app.title')), form));
   password.focus();
 }
