@@ -36,6 +36,7 @@ struct control {
     int64_t hits;       /* calls that were hit */
     int64_t changes;    /* not 0: calls that change nothing are not counted */
     int64_t wall_s;     /* added to the wall clock */
+    int64_t every;      /* calls from one that is hit to the next */
     char folder[512];
     char call[64];      /* the call that was hit last */
 };
@@ -106,6 +107,8 @@ static int hit(const char *name, int changes, int at, const char *path, size_t b
         return 0;
     int64_t number = __atomic_add_fetch(&control->count, 1, __ATOMIC_SEQ_CST);
     if (number < control->first || number > control->last)
+        return 0;
+    if ((number - control->first) % control->every)
         return 0;
     __atomic_add_fetch(&control->hits, 1, __ATOMIC_SEQ_CST);
     snprintf(control->call, sizeof control->call, "%s", name);

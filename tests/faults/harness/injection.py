@@ -17,7 +17,7 @@ Action = Literal["count", "kill", "fail", "stall", "slow"]
 _ACTIONS = {"count": 3, "kill": 1, "fail": 2, "stall": 3, "slow": 4}
 _NEVER = 1 << 62
 _SOURCE = Path(__file__).parent / "faults.c"
-_WORDS, _FOLDER, _CALL = struct.Struct("8q"), 512, 64
+_WORDS, _FOLDER, _CALL = struct.Struct("9q"), 512, 64
 _ACTION, _WALL = 3 * 8, 7 * 8
 """Offsets of these words, bytes."""
 
@@ -58,9 +58,10 @@ class Injection:
         *,
         first: int = 1,
         count: int = _NEVER,
+        every: int = 1,
         changes: bool = False,
     ) -> None:
-        """Hit calls on files below a folder, from the first-th on, so many.
+        """Hit calls on files below a folder, from the first-th on every so many, so many in all.
 
         Args:
             action, value: "fail" with an errno, "stall" for milliseconds, "slow" to bytes a
@@ -71,8 +72,8 @@ class Injection:
         first = _NEVER if action == "count" else first
         where = os.fsencode(folder) + b"\0"
         self._memory[_WORDS.size : _WORDS.size + len(where)] = where
-        last = min(_NEVER, first + count - 1)
-        words = (0, first, last, 0, value, 0, int(changes), self._wall_s)
+        last = min(_NEVER, first + (count - 1) * every)
+        words = (0, first, last, 0, value, 0, int(changes), self._wall_s, every)
         self._memory[: _WORDS.size] = _WORDS.pack(*words)
         struct.pack_into("q", self._memory, _ACTION, _ACTIONS[action])
 

@@ -53,7 +53,7 @@ PARTS: dict[str, Callable[[Extent], list[Row]]] = {
     "purge": lambda _: purge_rows(),
     "small-disk": lambda _: small_disk_rows(),
     "stalls": lambda e: stall_rows(80, e.seed),
-    "errnos": lambda _: errno_rows(rounds=5),
+    "errnos": lambda _: errno_rows(),
     "soak": lambda e: soak_rows(e.scans, "quick" if e.quick else ""),
 }
 SHORT = ("disk", "messages", "intake", "files", "clocks", "kills", "stops")

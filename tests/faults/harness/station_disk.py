@@ -22,6 +22,7 @@ from injection import ERRNOS, Injection
 from table import Row
 
 _RETURN_S = 10.0
+_ERRNOS_A_LIFE = 4
 _SETTLED_S = 4.0
 """A fault at one call is over by then: the pauses of sync, workers and recovery are shorter."""
 _OUTAGE_S = 3.0
@@ -40,26 +41,32 @@ _SLOW_BYTES_S = 1_000_000
 _SMALL_MB, _LEFT_MB = 400, 70
 
 
-def errno_rows(rounds: int) -> list[Row]:
-    """An errno at each file call of sync, control and workers; then at all of them for seconds.
+def errno_rows() -> list[Row]:
+    """Each errno at each file call of sync, control and workers; then at all of them for seconds.
 
-    Args:
-        rounds: how many of the errnos each call meets; the next call begins with the next one.
+    Each of these processes meets several errnos in one life, far apart: the next scan after them
+    shows whether the booth is well.
     """
     with (
         tempfile.TemporaryDirectory() as name,
         running_booth(Path(name), job="quick", settings=_SETTINGS) as (booth, scans),
     ):
-        rows = []
-        for role in booth.disk:
-            calls = _calls_of_a_scan(booth, scans, role)
-            points = itertools.product(range(rounds), range(1, calls + 1))
-            found = [
-                _one_call(booth, scans, role, ERRNOS[(at + shift) % len(ERRNOS)], at)
-                for shift, at in points
-            ]
-            met = [back_s for hit, back_s in found if hit]
-            rows.append(_return_row(f"errnos at the {calls} calls of {role} in a scan", met))
+        calls = {role: _calls_of_a_scan(booth, scans, role) for role in booth.disk}
+        longest = max(-(-count // _ERRNOS_A_LIFE) for count in calls.values())
+        hits: Counter[str] = Counter()
+        backs = []
+        for code, at in itertools.product(ERRNOS, range(1, longest + 1)):
+            met, back_s = _one_life(booth, scans, calls, code, at)
+            hits.update(met)
+            backs.append(back_s)
+        of = ", ".join(
+            f"{role} {hits[role]} of {len(ERRNOS) * count}" for role, count in calls.items()
+        )
+        missed = [role for role, count in calls.items() if hits[role] < len(ERRNOS) * count]
+        rows = [
+            Row("each errno at each file call", "all are met", of, not missed),
+            _return_row(f"after {sum(hits.values())} errnos in {len(backs)} lives", backs),
+        ]
         outages = [_outage(booth, scans, role, code) for role in booth.disk for code in ERRNOS]
         rows.append(_return_row(f"every call fails for {_OUTAGE_S:g} s", outages))
         scans.settle()
@@ -79,14 +86,35 @@ def _calls_of_a_scan(booth: Booth, scans: Scans, role: str) -> int:
     return booth.disk[role].calls
 
 
-def _one_call(booth: Booth, scans: Scans, role: str, code: int, at: int) -> tuple[bool, float]:
-    """Whether the call came, and the seconds from the disk's return to a scan's delivery."""
-    disk = booth.disk[role]
-    disk.arm(booth.folder, "fail", code, first=at, count=1)
-    scans.take()
-    until(lambda: disk.hits > 0 and _idle(booth), _SETTLED_S)
-    disk.disarm()
-    return disk.hits > 0, _next_delivered_s(scans)
+def _one_life(
+    booth: Booth, scans: Scans, calls: dict[str, int], code: int, at: int
+) -> tuple[dict[str, int], float]:
+    """Errnos met by each process, and the seconds from the disk's return to a scan's delivery.
+
+    A process meets them at its at-th call and then always after a share of a scan's calls. A scan
+    that they end does not come to all calls: the next one does.
+    """
+    wanted = {}
+    for role, count in calls.items():
+        every = -(-count // _ERRNOS_A_LIFE)
+        wanted[role] = max(0, -(-(count + 1 - at) // every)) if at <= every else 0
+        if wanted[role]:
+            booth.disk[role].arm(
+                booth.folder, "fail", code, first=at, count=wanted[role], every=every
+            )
+
+    def met() -> bool:
+        return all(booth.disk[role].hits >= count for role, count in wanted.items())
+
+    for _ in range(_ERRNOS_A_LIFE + 1):
+        scans.take()
+        until(lambda: met() or _idle(booth), _SETTLED_S)
+        if met():
+            break
+    for role in wanted:
+        booth.disk[role].disarm()
+    found = {role: booth.disk[role].hits for role, count in wanted.items() if count}
+    return found, _next_delivered_s(scans)
 
 
 def _outage(booth: Booth, scans: Scans, role: str, code: int) -> float:
