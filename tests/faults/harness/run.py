@@ -35,6 +35,7 @@ class Extent:
     seed: int
     scans: int
     """Scans of the soak."""
+    kills: int
     quick: bool
     """The soak's jobs only read the bundle: the processes that live on do the same."""
 
@@ -45,7 +46,7 @@ PARTS: dict[str, Callable[[Extent], list[Row]]] = {
     "intake": lambda e: intake_rows(50_000 if e.long else 2_000, e.seed),
     "files": lambda e: _fuzzed_files(100_000 if e.long else 300, e.seed),
     "clocks": lambda e: property_rows(10_000 if e.long else 200, e.seed),
-    "kills": lambda e: kill_rows(200 if e.long else 2, e.seed),
+    "kills": lambda e: kill_rows(e.kills if e.long else 2, e.seed),
     "stops": lambda e: stop_rows(() if e.long else ("sync",)),
     "sensors": lambda e: sensor_rows(5, e.seed),
     "wall-clock": lambda _: wall_clock_rows(),
@@ -65,9 +66,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=PARTS, help="these parts of the table alone")
     parser.add_argument("--scans", type=int, default=1440, help="of the soak")
+    parser.add_argument("--kills", type=int, default=200, help="of the long form")
     parser.add_argument("--quick", action="store_true", help="a soak whose jobs fit no body")
     arguments = parser.parse_args()
-    extent = Extent(arguments.long, arguments.seed, arguments.scans, arguments.quick)
+    extent = Extent(
+        arguments.long, arguments.seed, arguments.scans, arguments.kills, arguments.quick
+    )
     rows: list[Row] = []
     for part in arguments.only or (PARTS if extent.long else SHORT):
         began_s = time.monotonic()
