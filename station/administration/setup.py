@@ -184,10 +184,13 @@ def _record_virtual_booth(out: Path) -> Path:
         [sys.executable, "-m", "station.simulation.shipped", str(out)],
         cwd="/",
         check=False,
+        capture_output=True,
+        text=True,
         **user,  # type: ignore[call-overload]
     )
     if done.returncode:
-        raise BoothError(f"the virtual booth was not recorded; is there space in {out.parent}?")
+        cause = str(done.stderr).strip().rpartition("\n")[2]
+        raise BoothError(f"the virtual booth could not be recorded in {out.parent} ({cause})")
     return out
 
 

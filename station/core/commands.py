@@ -5,6 +5,7 @@ The group imports a subcommand only when it is called.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import sys
 from collections.abc import Mapping
@@ -62,6 +63,16 @@ def run(group: click.Group) -> None:
         group()
     except BoothError as error:
         click.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+            raise
+        where = f": {error.filename}" if error.filename else ""
+        click.echo(
+            f"error: the disk cannot be written ({error.strerror}{where}); free some space, then "
+            "run the command again",
+            err=True,
+        )
         sys.exit(1)
     except ModuleNotFoundError as error:
         remedy = _OPTIONAL.get(error.name or "")

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from station import cli as station_cli
-from station.core.commands import LazyGroup
+from station.core.commands import LazyGroup, run
 from workers import cli as workers_cli
 
 _ALL = [
@@ -39,6 +39,22 @@ def test_help_lists_every_command_without_importing_it(
     result = CliRunner().invoke(group, ["--help"])
     assert result.exit_code == 0
     assert all(name in result.output for name in group.list_commands(click.Context(group)))
+
+
+def test_a_full_disk_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @click.group(invoke_without_command=True)
+    def write() -> None:
+        with Path("/dev/full").open("w") as full:
+            full.write("x")
+
+    monkeypatch.setattr(sys, "argv", ["write"])
+    with pytest.raises(SystemExit, match="1"):
+        run(write)
+    told = capsys.readouterr().err
+    assert told.startswith("error: the disk cannot be written (No space left on device)")
+    assert told.count("\n") == 1
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
