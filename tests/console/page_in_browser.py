@@ -317,7 +317,7 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     compare = "/".join(scan["scan_id"] for scan in scans[:2])
     for view, shown in (
         ("scan", "#go:enabled"),
-        ("booth", "[data-camera][data-state=streaming]"),
+        ("booth", "[data-camera=back-upper][data-state=streaming]"),
         ("history", "tr[data-scan]"),
         (f"compare/{compare}", "canvas[data-ready=yes]"),
         ("calibration", "#calibrate"),
@@ -331,9 +331,9 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     expect(page.locator("svg")).to_be_visible()
     _picture(page, "person-zh")
     assert _ENGLISH.findall(page.locator("body").inner_text()) == []
-    page.goto(console.url)
-    page.select_option("#language", "en")
     open_view(page, console, f"result/{scans[0]['scan_id']}")
+    expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
+    page.select_option("#language", "en")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("Waist", timeout=20_000)
 
 
