@@ -107,7 +107,7 @@ class HandOver:
     def try_all(self, name: str, now_s: float) -> None:
         """Hand over the results that are due to one target."""
         for entry in self._ledger.waiting():
-            if entry.target == name and entry.next_s <= now_s:
+            if entry.target == name and entry.due(now_s):
                 self._round_s[name] = time.monotonic()
                 self._try(entry, now_s)
 

@@ -31,6 +31,10 @@ class Waiting:
     """Moment of the next try, seconds since 1970."""
     error: str = ""
 
+    def due(self, now_s: float) -> bool:
+        """Whether it is time for the next try; a wall clock that was put back delays none."""
+        return self.next_s <= now_s or self.next_s > now_s + PAUSES_S[-1]
+
     def document(self) -> dict[str, Any]:
         moment = datetime.fromtimestamp(self.next_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         return {"target": self.target, "scan_id": self.scan_id, "tries": self.tries,

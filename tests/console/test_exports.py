@@ -32,7 +32,7 @@ from station.core.geometry import so3_exp
 from station.core.service import set_up_logs
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver
-from station.handover.ledger import PAUSES_S, Ledger
+from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from workers.measure.definitions import DEFINITIONS
 
 _DOCUMENT: dict[str, Any] = {
@@ -185,6 +185,14 @@ def _hand_over(
         shutil.copytree(console.config.spool.folder / "outbox" / scan_id, outbox / scan_id)
     loaded = load_config(config)
     return HandOver(loaded, set_up_logs("deliver")), Ledger(loaded.spool.folder)
+
+
+def test_a_wall_clock_that_was_put_back_delays_no_hand_over() -> None:
+    entry = Waiting("orders", "a").failed("no answer", now_s=1e9 + 40 * 86_400)
+    assert entry.due(1e9)
+    entry = entry.failed("no answer", now_s=1e9)
+    assert not entry.due(1e9)
+    assert entry.due(1e9 + PAUSES_S[1])
 
 
 def test_a_webhook_is_tried_until_it_takes_the_result_and_never_again(
