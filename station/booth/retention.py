@@ -8,6 +8,7 @@ deletes later, never earlier.
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from dataclasses import asdict, dataclass, field, replace
@@ -101,7 +102,10 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
     with held(spool.folder / "retention.lock", _BUSY):
         ages = advance(_load(spool), now or Moment.now())
         folders = [
-            f"{state}/{folder.name}" for state, folder in spool.all_scans() if state in limits_s
+            f"{state}/{name}"
+            for state in STATES
+            if state in limits_s
+            for name in sorted(os.listdir(spool.folder / state))
         ]
         folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
         ages, old = due(ages, folders, limits_s)

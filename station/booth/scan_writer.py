@@ -108,6 +108,8 @@ class ScanWriter:
                 self._log.exception("the outcome of a scan could not be recorded")
             finally:
                 self._begun_s = None
+                # A finished scan's frames must not stay in memory until the next one comes.
+                del task
 
     def stalled(self, now_s: float) -> str:
         """The disk's delay in words, once it is long; empty otherwise."""

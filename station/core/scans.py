@@ -29,7 +29,6 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -245,12 +244,6 @@ class ScanFolders:
                 if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
             )
 
-    def all_scans(self) -> Iterator[tuple[str, Path]]:
-        """All scans: (state, folder)."""
-        for state in STATES:
-            for entry in sorted((self.folder / state).iterdir()):
-                yield state, entry
-
 
 def count_scans(folder: Path) -> dict[str, int]:
     """State -> how many scans of a spool are in it; read-only.
@@ -259,7 +252,7 @@ def count_scans(folder: Path) -> dict[str, int]:
         OSError: the spool belongs to another user.
     """
     found = {state: folder / state for state in STATES if (folder / state).is_dir()}
-    counts = {state: len(list(place.iterdir())) for state, place in found.items()}
+    counts = {state: len(os.listdir(place)) for state, place in found.items()}
     return {state: count for state, count in counts.items() if count}
 
 
