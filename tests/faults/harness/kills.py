@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import random
 import signal
-import tempfile
 import threading
 import time
-from pathlib import Path
 
-from booth import Booth, Scans, until, whole_booth
+from booth import Booth, Scans, until
 from table import Row, percentile
 
 _ISOLATED_S, _REPEATED_S = 3.0, 6.0
@@ -21,17 +19,13 @@ _AGAIN = 0.25
 _MAX_WAITING = 3
 
 
-def kill_rows(kills: int, seed: int) -> list[Row]:
-    """Kill so many processes of a booth with console and hand-over."""
-    with (
-        tempfile.TemporaryDirectory() as name,
-        whole_booth(Path(name)) as (booth, scans),
-    ):
-        killed = _kill(booth, scans, kills, random.Random(seed))
-        # Each kill may rightly have cost its scan; nothing costs this one.
-        scans.take()
-        scans.settle()
-        rows = [scans.row(f"kill -9 at random moments, {kills} times")]
+def kill_rows(booth: Booth, scans: Scans, kills: int, seed: int) -> list[Row]:
+    """Kill so many processes of a booth."""
+    killed = _kill(booth, scans, kills, random.Random(seed))
+    # Each kill may rightly have cost its scan; nothing costs this one.
+    scans.take()
+    scans.settle()
+    rows = [scans.row(f"kill -9 at random moments, {kills} times")]
     for kind, limit_s in (("isolated", _ISOLATED_S), ("repeated", _REPEATED_S)):
         times = [back_s for of, back_s in killed if of == kind]
         if times:

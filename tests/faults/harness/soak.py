@@ -16,6 +16,7 @@ _SLOPE_MB_H = 1.0
 _DESCRIPTORS = 2
 """A connection that is being opened or closed, and a file."""
 _SAMPLES = 60
+_LOOKS, _BETWEEN_LOOKS_S = 10, 0.1
 _WARM = 0.2
 """Share of the scans after which caches are full, and growth counts."""
 _LOG_EVERY = 100
@@ -72,12 +73,19 @@ def _look_at_console(booth: Booth) -> None:
 
 
 def _sizes(booth: Booth) -> dict[str, tuple[int, int]]:
-    """Resident bytes and open descriptors of each process that lives on."""
-    found = {}
-    for process in booth.processes():
-        for pid in booth.pids(process):
-            of = psutil.Process(pid)
-            found[f"{process} {pid}"] = of.memory_info().rss, of.num_fds()
+    """Resident bytes and open descriptors of each process that lives on.
+
+    The least of some looks: frames that come and go in between are no growth.
+    """
+    found: dict[str, tuple[int, int]] = {}
+    of = {f"{name} {pid}": pid for name in booth.processes() for pid in booth.pids(name)}
+    for _ in range(_LOOKS):
+        for name, pid in of.items():
+            process = psutil.Process(pid)
+            now = process.memory_info().rss, process.num_fds()
+            before = found.get(name, now)
+            found[name] = min(before[0], now[0]), min(before[1], now[1])
+        time.sleep(_BETWEEN_LOOKS_S)
     return found
 
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-import tempfile
 import time
-from pathlib import Path
 
-from booth import WAIT_S, Booth, until, whole_booth
+from booth import WAIT_S, Booth, Scans, until
 from table import Row
 
 _NAMED_S, _REPLACED_S = 5.0, 15.0
@@ -16,17 +14,12 @@ _GAP_S = 1.0
 """The longest time without a new frameset that counts as unharmed: reports are 0.25 s apart."""
 
 
-def stop_rows(only: tuple[str, ...] = ()) -> list[Row]:
-    """Stop each process of a booth with console and hand-over, or only some."""
-    with (
-        tempfile.TemporaryDirectory() as name,
-        whole_booth(Path(name)) as (booth, scans),
-    ):
-        rows = [_stop(booth, process) for process in only or booth.processes()]
-        scans.take()
-        scans.settle()
-        rows.append(scans.row("a scan after all of them"))
-    return rows
+def stop_rows(booth: Booth, scans: Scans, only: tuple[str, ...] = ()) -> list[Row]:
+    """Stop each process of a booth, or only some."""
+    rows = [_stop(booth, process) for process in only or booth.processes()]
+    scans.take()
+    scans.settle()
+    return [*rows, scans.row("a scan after all of them")]
 
 
 def _stop(booth: Booth, name: str) -> Row:
