@@ -16,6 +16,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
+from station.core.errors import SpoolError
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -32,6 +33,10 @@ CREATE INDEX IF NOT EXISTS by_time ON scans (created DESC, scan_id DESC);
 CREATE TABLE IF NOT EXISTS folders (place TEXT PRIMARY KEY, changed_ns INTEGER NOT NULL);
 """
 _COLUMNS = "scan_id, state, label, booth, created, finished, reasons, seconds"
+
+
+class IndexBusyError(SpoolError):
+    """The index cannot be read at the moment."""
 
 
 class ScanIndex:
@@ -112,14 +117,24 @@ class ScanIndex:
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
         try:
-            database = self._connect()
+            with closing(self._connected()) as database:
+                yield database
+        except sqlite3.OperationalError as error:
+            raise IndexBusyError(
+                f"the index of scans cannot be used ({error}); try again"
+            ) from None
+
+    def _connected(self) -> sqlite3.Connection:
+        try:
+            return self._connect()
+        except sqlite3.OperationalError:
+            # Locked for long, or a busy disk: others are at work in a sound file.
+            raise
         except sqlite3.DatabaseError:
             # Damaged, or not this program's: its contents are rebuilt from the folders.
             for suffix in ("", "-wal", "-shm"):
                 Path(f"{self._path}{suffix}").unlink(missing_ok=True)
-            database = self._connect()
-        with closing(database):
-            yield database
+            return self._connect()
 
     def _connect(self, *, shared: bool = False) -> sqlite3.Connection:
         mask = os.umask(0o177)
@@ -139,7 +154,9 @@ class ScanIndex:
             if found not in (0, _VERSION):
                 raise sqlite3.DatabaseError(f"version {found}")
             database.executescript(_SCHEMA)
-            database.execute(f"PRAGMA user_version = {_VERSION}")
+            if found == 0:
+                # Only once: whoever writes waits for all others who do.
+                database.execute(f"PRAGMA user_version = {_VERSION}")
         except sqlite3.Error:
             database.close()
             raise

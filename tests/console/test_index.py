@@ -2,13 +2,15 @@
 
 import json
 import shutil
+import sqlite3
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
-from station.archive.index import FILE, ScanIndex
+from station.archive.index import FILE, IndexBusyError, ScanIndex
 from station.archive.records import ScanRecord
 from station.booth.retention import purge
 from station.cli import station
@@ -88,6 +90,23 @@ def test_a_lost_or_damaged_index_is_made_anew(spool: Spool, damage: bytes) -> No
     if damage:
         (spool.folder / FILE).write_bytes(damage)
     assert len(ScanIndex(spool).find()) == 4
+
+
+def test_a_locked_index_is_not_thrown_away(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever held the file open lost it, and answered the next request with a server error."""
+    index = ScanIndex(spool)
+    assert len(index.find()) == 4
+    monkeypatch.setattr("station.archive.index._BUSY_S", 0.1)
+    path = spool.folder / FILE
+    before = path.stat().st_ino
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("PRAGMA locking_mode = EXCLUSIVE")
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(IndexBusyError, match="try again"):
+            index.find()
+        other.execute("COMMIT")
+    assert path.stat().st_ino == before
+    assert len(index.find()) == 4
 
 
 def test_the_index_follows_the_folders(spool: Spool) -> None:

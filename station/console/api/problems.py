@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
+from station.archive.index import IndexBusyError
 from station.console.live.control import NotRunningError, RefusedError
 from station.core.errors import BoothError
 
@@ -49,7 +50,7 @@ _MEANINGS = {
     422: "A value is missing or invalid",
     429: "Too many passwords, wrong or at once; Retry-After says how long to wait",
     431: "The headers are too large",
-    503: "No station is responding",
+    503: "No station is responding, or its disk is too busy",
 }
 _ALWAYS = (401, 403, 408, 413, 421, 422, 431, 503)
 
@@ -86,6 +87,8 @@ def install(app: FastAPI) -> None:
     async def _booth(request: Request, error: BoothError) -> JSONResponse:  # noqa: ARG001
         if isinstance(error, NotRunningError):
             return _answer(503, "station-not-running", str(error))
+        if isinstance(error, IndexBusyError):
+            return _answer(503, "busy", str(error))
         kind = "refused" if isinstance(error, RefusedError) else "not-possible"
         return _answer(409, kind, str(error))
 
