@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.ball_shape import SHAPE
 from station.calibration.adjust.equations import ball_rows, center_equations, corrected_centers
 from station.calibration.adjust.problem import Sightings
 from station.calibration.adjust.sensor_model import COARSE, image_place
@@ -80,7 +81,7 @@ def true_correction(error: UnitError) -> DepthCorrection:
     """The correction that undoes a unit's depth error."""
     shift = 0.25 * error.bias_m
     tilt_x, tilt_y = error.tilt
-    parameters = (shift, error.gain, error.curvature, shift * tilt_x, shift * tilt_y)
+    parameters = (shift, error.gain, error.curvature, shift * tilt_x, shift * tilt_y, 0.0)
     return COARSE.correction(np.array(parameters))
 
 
@@ -187,8 +188,9 @@ def _ball(
     )
     sightings = Sightings.of(believed, [seen])
     nothing = np.zeros(COARSE.size)
-    detected = corrected_centers(sightings, believed, COARSE, nothing, stated)
-    rows = ball_rows(sightings, believed, COARSE, detected, nothing, stated)
+    sphere = np.zeros((1, SHAPE))
+    detected = corrected_centers(sightings, believed, COARSE, nothing, stated, sphere)
+    rows = ball_rows(sightings, believed, COARSE, detected, nothing, stated, sphere)
     matrix, _ = center_equations(sightings, rows)
     return replace(
         seen, center_m=detected[0], covariance_m2=np.linalg.inv(matrix[0, :3, :3]).astype(float)

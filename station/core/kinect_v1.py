@@ -65,6 +65,16 @@ def depth_m_of_raw(raw: NDArray[np.integer]) -> NDArray[np.float64]:
     return np.where(usable, depth, 0.0)
 
 
+def registration_law(inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse depth by the law of libfreenect's registration, of one by the tangent law.
+
+    1/z = (1 - m / b) / z0 with m = ((raw - 800) / 4 - 0.375) p: linear in the raw value, as
+    triangulation has it. Constants as most units state them: z0 = 1.2 m, p = 1.042 mm, b = 75 mm.
+    """
+    raw = 2842.5 * (np.arctan(1.0 / (0.1236 * inverse)) - 1.1863)
+    return np.asarray((1.0 - 1.042e-3 * ((raw - 800.0) / 4.0 - 0.375) / BASELINE_M) / 1.2)
+
+
 TABLE: NDArray[np.uint16] = np.rint(depth_m_of_raw(np.arange(2048)) / DEPTH_SCALE_M).astype(
     np.uint16
 )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.kinect_v1 import NO_READING
-from station.simulation.violations import SmoothBias, raw_by_libfreenect
+from station.simulation.violations import SmoothBias, ZeroPlane
 
 BASELINE_M = 0.075
 _WINDOW_PX = 9
@@ -32,12 +32,12 @@ Image = NDArray[np.float32]
 
 
 def raw_from_depth(
-    depth_m: NDArray[np.floating], libfreenect_law: bool = False
+    depth_m: NDArray[np.floating], zero_plane: ZeroPlane | None = None
 ) -> NDArray[np.uint16]:
     """The nearest raw 11-bit values; no reading where the depth is 0 or out of range."""
     seen = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
     safe = np.where(seen, depth_m, 1.0)
-    raw = raw_by_libfreenect(safe) if libfreenect_law else raw_by_tangent(safe)
+    raw = raw_by_tangent(safe) if zero_plane is None else zero_plane.raw(safe)
     return np.where(seen, np.clip(np.rint(raw), 0, NO_READING - 1), NO_READING).astype(np.uint16)
 
 
@@ -82,7 +82,7 @@ class UnitError:
     curvature: float = 0.0
     """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
     smooth: SmoothBias | None = None
-    libfreenect_law: bool = False
+    zero_plane: ZeroPlane | None = None
     frozen_share: float = 0.0
     """Share of the noise's variance that is the same in every frame ..."""
     frozen_seed: tuple[int, ...] = ()
@@ -112,9 +112,9 @@ class UnitError:
 
     def decoded_m(self, depth_m: Any) -> Any:
         """Depth that the station makes of a depth that the unit encodes by its own law."""
-        if not self.libfreenect_law:
+        if self.zero_plane is None:
             return depth_m
-        return 0.1236 * np.tan(raw_by_libfreenect(depth_m) / 2842.5 + 1.1863)
+        return 0.1236 * np.tan(self.zero_plane.raw(depth_m) / 2842.5 + 1.1863)
 
 
 def axial_sigma_m(depth_m: Image, incidence_rad: Image) -> Image:
@@ -165,7 +165,7 @@ class NoiselessView:
             noise = np.sqrt(1.0 - share) * noise + np.sqrt(share) * self.frozen
         measured = np.where(self.seen, self.depth_m + self.sigma_m * noise, 0.0).astype(np.float32)
         measured[rng.random(self.depth_m.shape, dtype=np.float32) < self.fade] = 0.0
-        return raw_from_depth(_flying(measured, rng), self.unit.libfreenect_law)
+        return raw_from_depth(_flying(measured, rng), self.unit.zero_plane)
 
 
 def _correlated(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:

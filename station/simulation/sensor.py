@@ -33,8 +33,8 @@ FRAME_RATE_HZ = 30.0
 _SWAY_PERIOD_S = 3.1
 _LEAN_STEP_M = 0.00025
 """A view is rendered again when the lean has changed by this much: far below the sensor's noise."""
-_FACTORY_SIGMA = (3e-4, 1.5e-3)
-"""Gain and curvature of inverse depth among units that have depth errors at all."""
+_FACTORY_ENDS = (5e-4, 2.5e-3)
+"""Largest gain and curvature of inverse depth among units that have depth errors at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +102,14 @@ class SimulatedUnit:
         """A camera's unit; the same in every simulation of this booth."""
         index = list(booth.rig.cameras).index(name)
         rng = np.random.default_rng((booth.seed, index, 1))
-        made = np.random.default_rng((booth.seed, index, 5)).normal(0.0, _FACTORY_SIGMA)
+        made = np.random.default_rng((booth.seed, index, 5)).uniform(-1.0, 1.0, 2) * _FACTORY_ENDS
         return cls(
             error=UnitError(
                 booth.bias_m * rng.uniform(-1.0, 1.0),
                 tuple(rng.uniform(-0.3, 0.3, 2)),
                 *_with_gain(made if booth.bias_m else np.zeros(2), booth, index),
                 violations.smooth_bias(booth.violations, booth.seed, index),
-                violations.RAW_LAW in booth.violations,
+                violations.zero_plane(booth.violations, booth.seed, index),
                 violations.frozen_share(booth.violations),
                 (booth.seed, index, 10),
             ),

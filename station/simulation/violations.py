@@ -36,7 +36,8 @@ HELPER = "helper"
 HAND = "hand"
 """The ball is gripped from changing sides by a hand that covers up to half of it."""
 RAW_LAW = "raw-law"
-"""Raw values by libfreenect's own law (its zero-plane constants), decoded by the tangent law."""
+"""Raw values by libfreenect's own law (its zero-plane constants, a little different in each unit),
+decoded by the tangent law."""
 ALL = (BIAS, LENS, K1, FLOOR, BALL, OVAL, FROZEN, HELPER, HAND, RAW_LAW)
 
 _BIAS_RMS_M, _BIAS_AT_M = 1.5e-3, 1.7
@@ -182,10 +183,31 @@ _ZERO_PLANE_M, _PIXEL_MM, _EMITTER_CM = 1.2, 0.1042, 7.5
 """libfreenect's zero-plane constants: reference distance, pixel size and baseline."""
 
 
-def raw_by_libfreenect(depth_m: Array) -> Array:
-    """Raw values (not rounded) after libfreenect's registration, 1/z linear in the raw value.
+_PLANE_ENDS_M, _PIXEL_ENDS_MM = 4e-3, 1.5e-4
+"""Largest differences of a unit's constants."""
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroPlane:
+    """One unit's constants of libfreenect's law: 1/z is linear in the raw value.
 
     z = z0 b / (b - m) with m = ((raw - 800) / 4 - 0.375) p (libfreenect, registration.c).
     """
-    metric = _EMITTER_CM * (1.0 - _ZERO_PLANE_M / depth_m)
-    return np.asarray(4.0 * (metric / _PIXEL_MM + 0.375) + 800.0)
+
+    distance_m: float = _ZERO_PLANE_M
+    pixel_mm: float = _PIXEL_MM
+
+    def raw(self, depth_m: Array) -> Array:
+        """Raw values (not rounded) of depths."""
+        metric = _EMITTER_CM * (1.0 - self.distance_m / depth_m)
+        return np.asarray(4.0 * (metric / self.pixel_mm + 0.375) + 800.0)
+
+
+def zero_plane(switches: frozenset[str], seed: int, unit: int) -> ZeroPlane | None:
+    """A unit's own law, where it is not the tangent law."""
+    if RAW_LAW not in switches:
+        return None
+    off = _rng(seed, 7, unit).uniform(-1.0, 1.0, 2)
+    return ZeroPlane(
+        _ZERO_PLANE_M + _PLANE_ENDS_M * float(off[0]), _PIXEL_MM + _PIXEL_ENDS_MM * float(off[1])
+    )

@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from station.calibration.adjust.ball_shape import SHAPE, shape_terms, shape_turn
 from station.calibration.adjust.equations import ROUNDNESS, TREMOR_M, BallEquations
 from station.calibration.adjust.sensor_model import BALL, FIELD, FULL, LENS, POLYNOMIAL
 from station.calibration.adjust.trajectory import KNOT_S, TimeGrid, path_points
@@ -38,12 +39,13 @@ def test_a_balls_inverse_depth_and_its_derivative(seed: int) -> None:
 def test_nuisance_of_a_detection_widens_its_covariance_and_moves_nothing(seed: int) -> None:
     """A tremor of the hand and a ball that is not quite round must not pull the centre."""
     rng = np.random.default_rng(seed)
-    rows = rng.normal(0, 1e3, (2, 20, 4))
-    matrix, gradient = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, 4))
-    firm = BallEquations(matrix, gradient, np.zeros((2, 4, 0)), np.zeros((0, 0)), np.zeros(0))
+    size = 4 + SHAPE
+    rows = rng.normal(0, 1e3, (2, 20, size))
+    matrix, gradient = np.swapaxes(rows, 1, 2) @ rows, rng.normal(0, 1e3, (2, size))
+    firm = BallEquations(matrix, gradient, np.zeros((2, size, 0)), np.zeros((0, 0)), np.zeros(0))
     loose = firm.marginalised(0.1, np.ones(2))
     before, after = (np.linalg.inv(balls.matrix) for balls in (firm, loose))
-    prior = np.diag([TREMOR_M**2] * 3 + [(0.1 * ROUNDNESS) ** 2])
+    prior = np.diag([TREMOR_M**2] * 3 + [(0.1 * ROUNDNESS) ** 2] + [0.0] * SHAPE)
     assert np.allclose(after, before + prior, rtol=1e-6)
     best, still = (
         np.linalg.solve(balls.matrix, balls.gradient[..., None]) for balls in (firm, loose)
@@ -53,12 +55,24 @@ def test_nuisance_of_a_detection_widens_its_covariance_and_moves_nothing(seed: i
 
 @given(SEEDS)
 @settings(max_examples=10, deadline=None)
+def test_the_shape_of_a_ball_turns_with_its_frame(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, shape = se3_exp(rng.normal(0, 1, 6))[:3, :3], rng.normal(0, 1, SHAPE)
+    normals = rng.normal(0, 1, (7, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert np.allclose(
+        shape_terms(normals @ turn.T) @ (shape_turn(turn) @ shape), shape_terms(normals) @ shape
+    )
+
+
+@given(SEEDS)
+@settings(max_examples=10, deadline=None)
 def test_the_correction_is_the_one_that_was_solved_for(seed: int) -> None:
     """Polynomial, gradient and field act on whole images as they did on single patches."""
     rng = np.random.default_rng(seed)
     parameters = np.concatenate(
         [
-            rng.normal(0, [5e-3, 1e-3, 3e-3, 2e-3, 2e-3]),
+            rng.normal(0, [5e-3, 1e-3, 3e-3, 2e-3, 2e-3, 1.0]),
             np.zeros(LENS + BALL),
             rng.normal(0, 1e-3, FIELD),
         ]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from station.calibration.adjust.averaging import averaged_state, most_probable_widths
-from station.calibration.adjust.problem import Layout, Problem, State, priors
+from station.calibration.adjust.priors import priors
+from station.calibration.adjust.problem import Layout, Problem, State
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import LEVELS, Widths
 from station.calibration.detect.detections import FLOOR

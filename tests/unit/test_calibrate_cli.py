@@ -185,7 +185,7 @@ def test_nobody_is_waited_for_unattended(capsys: pytest.CaptureFixture[str]) -> 
     for second in range(100):
         guide.progress(f"{second} s")
     guide.done("seen")
-    assert not guide.another("Once more?")
+    assert not guide.answers_yes("Once more?")
     lines = capsys.readouterr().out.split("\n")
     assert lines == ["", "Ball", "  Wave it.", "  0 s", "  seen", ""]
 

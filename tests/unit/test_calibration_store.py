@@ -42,7 +42,7 @@ def store(tmp_path: Path) -> CalibrationStore:
 def _finished(store: CalibrationStore, day: int) -> str:
     session = Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
     frames = [np.full((480, 640), 20000 + day, np.uint16)] * 2
-    session.keep_empty({"front-lower": static_view(frames, 1e-4)}, [])
+    session.record_empty({"front-lower": static_view(frames, 1e-4)}, [])
     return store.finish(_rig(day), {"day": day}).name
 
 
@@ -109,14 +109,16 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     session = Session.begin(tmp_path, STARTED, 0.08, CAMERAS)
     floor = PlaneObservation("front-lower", "floor", 1000, np.ones((3, 4)))
     view = static_view([np.full((480, 640), 20000, np.uint16)] * 2, 1e-4)
-    session.keep_empty({"front-lower": view}, [floor])
-    session.keep_resting(MARK, [_ball("front-lower", 5.0)])
-    session.keep_resting("around-0", [_ball("front-lower", 9.0)])
+    session.record_empty({"front-lower": view}, [floor])
+    session.record_resting(MARK, [_ball("front-lower", 5.0)])
+    session.record_resting("around-0", [_ball("front-lower", 9.0)])
     session.begin_run()
-    session.keep_balls([_ball("front-lower", 100.0), _ball("front-upper", 100.01)])
+    session.record_balls([_ball("front-lower", 100.0), _ball("front-upper", 100.01)])
     session.begin_run()
-    session.keep_balls([_ball("front-lower", 3.0)])
-    session.keep_lenses({"front-upper": Lens([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], [0] * 5)})
+    session.record_balls([_ball("front-lower", 3.0)])
+    session.record_lenses(
+        {"front-upper": Lens([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], [0] * 5)}
+    )
     again = Session.load(tmp_path)
     assert (again.radius_m, again.started) == (0.08, STARTED)
     assert again.done(EMPTY)
@@ -143,13 +145,13 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
 def test_a_line_that_was_cut_off_costs_only_itself(tmp_path: Path) -> None:
     """kill -9 in the middle of a write."""
     session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
-    session.keep_balls([_ball("front-lower", 1.0)])
+    session.record_balls([_ball("front-lower", 1.0)])
     path = tmp_path / JOURNAL
     whole = path.read_bytes()
     path.write_bytes(whole + whole[: len(whole) // 2])
     again = Session.load(tmp_path)
     assert len(again.balls) == 1
-    again.keep_balls([_ball("front-lower", 2.0)])
+    again.record_balls([_ball("front-lower", 2.0)])
     assert [ball.time_s for ball in Session.load(tmp_path).balls] == [1.0, 2.0]
 
 
@@ -158,7 +160,7 @@ def test_a_line_that_was_cut_off_costs_only_itself(tmp_path: Path) -> None:
 )
 def test_a_line_that_is_not_ours_is_named(tmp_path: Path, line: str) -> None:
     session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
-    session.keep_balls([_ball("front-lower", 1.0)])
+    session.record_balls([_ball("front-lower", 1.0)])
     path = tmp_path / JOURNAL
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(FormatError, match=r"observations\.jsonl: line 2"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.coverage import Coverage
-from station.calibration.solve.acceptance import HeldOut, inflated
+from station.calibration.solve.acceptance import HeldOut, widen_by_test
 from station.calibration.solve.refusals import STAND_WORDS, Limits, check_predicted
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -29,11 +29,11 @@ def _held_out(mean_m: float) -> HeldOut:
 
 def test_offsets_within_their_own_noise_widen_nothing() -> None:
     noise_m = RMS_M / np.sqrt(SECONDS)
-    assert inflated(SAID, {"a": _held_out(0.99 * noise_m), "b": _held_out(0.0)}) == SAID
+    assert widen_by_test(SAID, {"a": _held_out(0.99 * noise_m), "b": _held_out(0.0)}) == SAID
 
 
 def test_offsets_beyond_their_noise_widen_what_is_said() -> None:
-    found = inflated(SAID, {name: _held_out(2e-3) for name in "ab"})
+    found = widen_by_test(SAID, {name: _held_out(2e-3) for name in "ab"})
     unknown_m2 = (2e-3**2 - RMS_M**2 / SECONDS) / 6.0
     factor = np.sqrt(1.0 + unknown_m2 / SAID.normal_rms_m**2)
     assert factor > 1.5

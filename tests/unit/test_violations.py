@@ -27,7 +27,7 @@ def test_the_smooth_bias_is_as_large_as_it_says_and_differs_between_units() -> N
 
 def test_libfreenects_raw_law_differs_from_the_tangent_law_by_centimetres() -> None:
     depth = np.array([1.0, 1.7, 2.5])
-    raw = raw_from_depth(depth, libfreenect_law=True)
+    raw = raw_from_depth(depth, violations.ZeroPlane())
     assert (raw < NO_READING).all()
     off_m = 1e-4 * TABLE[raw] - depth
     assert 0.015 < abs(off_m[2]) < 0.035

@@ -34,7 +34,7 @@ def store(tmp_path: Path) -> CalibrationStore:
     store = CalibrationStore(tmp_path / "calibrations", tmp_path / "calibration.json")
     for day, depth in ((1, 20000), (2, 30000)):
         session = Session.begin(store.unfinished, "2026", 0.1, default_rig().cameras)
-        session.keep_empty({"front-lower": static_view(_frames(depth), 1e-4)}, [])
+        session.record_empty({"front-lower": static_view(_frames(depth), 1e-4)}, [])
         store.finish(replace(default_rig(), created=f"2026-11-0{day}T10:00:00Z"), {})
     return store
 

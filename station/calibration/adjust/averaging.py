@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
+from station.calibration.adjust.priors import priors, shape_precision
 from station.calibration.adjust.problem import (
     Indices,
     Layout,
     Problem,
     State,
     moved_state,
-    priors,
 )
-from station.calibration.adjust.sensor_model import FIELD
 from station.calibration.adjust.widths import (
     BOW,
     BOW_TOLERANCE,
@@ -35,10 +34,11 @@ from station.calibration.adjust.widths import (
     LEVELS,
     RADIUS,
     SENSOR,
+    SHAPE_LEVELS,
     Option,
     Widths,
-    options,
     sigma,
+    width_options,
 )
 
 Array = NDArray[np.float64]
@@ -48,25 +48,24 @@ Choice = tuple[int, ...]
 _BEYOND = 1e300
 """A corner that keeps a bordered matrix positive."""
 _UNLIKELY = 7.0
-"""Fields and choices less likely by a factor e^7 than the best do not count."""
+"""Choices less likely by a factor e^7 than the best do not count."""
 
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    fields = _fields(problem, state)
-    best = max(fields, key=lambda field: field.best[1])
+    best = max(_smooth_choices(problem, state), key=lambda one: one.best[1])
     return best.widths(best.best[0])
 
 
 def averaged_state(problem: Problem, state: State) -> State:
     """The state moved to the mean over all widths, with the covariance over them."""
     layout = Layout.of(problem)
-    fields = _fields(problem, state)
-    top = max(field.best[1] for field in fields)
-    likely = [field for field in fields if field.best[1] > top - _UNLIKELY]
-    logs = np.array([field.log_evidence() for field in likely])
+    found = _smooth_choices(problem, state)
+    top = max(one.best[1] for one in found)
+    likely = [one for one in found if one.best[1] > top - _UNLIKELY]
+    logs = np.array([one.log_evidence() for one in likely])
     weights = np.exp(logs - logsumexp(logs))
-    moments = [field.moments() for field in likely]
+    moments = [one.moments() for one in likely]
     mean = sum((w * step for w, (step, _) in zip(weights, moments, strict=True)), np.zeros(1))
     covariance = np.zeros((layout.size, layout.size))
     for weight, (step, spread) in zip(weights, moments, strict=True):
@@ -74,13 +73,24 @@ def averaged_state(problem: Problem, state: State) -> State:
     return replace(moved_state(problem, layout, state, mean), covariance=covariance)
 
 
-def _fields(problem: Problem, state: State) -> list[_Field]:
-    """The evidence for each level of the depth fields; the search goes on from the level before."""
+def _smooth_choices(problem: Problem, state: State) -> list[_SmoothChoice]:
+    """The evidence for levels of depth fields and ball shape, climbed from the middle.
+
+    Each search goes on from the best choice of the level before.
+    """
     base = _Base.of(problem, state)
-    found: list[_Field] = []
-    for field_per_m in FIELD_LEVELS:
-        found.append(_Field(base, float(field_per_m), found[-1].best[0] if found else None))
-    return found
+    levels = (len(FIELD_LEVELS), len(SHAPE_LEVELS) if len(base.shape) else 1)
+    here = (levels[0] // 2, levels[1] // 2)
+    found = {here: _SmoothChoice(base, here, None)}
+    while True:
+        for axis, step in ((0, -1), (0, 1), (1, -1), (1, 1)):
+            near = (here[0] + step * (axis == 0), here[1] + step * (axis == 1))
+            if near not in found and 0 <= near[axis] < levels[axis]:
+                found[near] = _SmoothChoice(base, near, found[here].best[0])
+        best = max(found, key=lambda one: found[one].best[1])
+        if best == here:
+            return list(found.values())
+        here = best
 
 
 @dataclass(frozen=True)
@@ -96,6 +106,8 @@ class _Base:
     """Unknowns of each class, one group a camera, or a single one."""
     fields: list[Indices]
     field_precision: Array
+    shape: Indices
+    shape_precision: Array
     radius_m: float
 
     @classmethod
@@ -117,7 +129,7 @@ class _Base:
         groups[RADIUS], groups[BOW] = [layout.radius], [layout.bow]
         certain = np.setdiff1d(
             np.arange(layout.size),
-            np.concatenate([*(g for own in groups.values() for g in own), *fields]),
+            np.concatenate([*(g for own in groups.values() for g in own), *fields, layout.shapes]),
         )
         kept = np.isin(np.arange(layout.size), certain)
         for prior in priors(problem, layout, state):
@@ -127,22 +139,29 @@ class _Base:
             gradient[prior.index] -= block @ prior.values
         return cls(
             tuple(problem.cameras), information, gradient, values, groups, fields,
-            model.field_precision, problem.radius_m,
+            model.field_precision, layout.shapes, shape_precision(problem, layout),
+            problem.radius_m,
         )  # fmt: skip
 
 
-class _Field:
-    """All choices of widths where the depth fields have one standard deviation."""
+class _SmoothChoice:
+    """All choices of the other widths where depth fields and ball shape have given ones."""
 
-    def __init__(self, base: _Base, field_per_m: float, start: Choice | None) -> None:
-        self._base, self._field_per_m = base, field_per_m
+    def __init__(self, base: _Base, levels: tuple[int, int], start: Choice | None) -> None:
+        self._base = base
+        self._field_per_m, self._shape = float(FIELD_LEVELS[levels[0]]), SHAPE_LEVELS[levels[1]]
         information, gradient = base.information.copy(), base.gradient.copy()
-        precision, cost = base.field_precision / field_per_m**2, 0.0
-        for index in base.fields:
+        parts = [(index, base.field_precision, self._field_per_m) for index in base.fields]
+        if len(base.shape):
+            parts.append((base.shape, base.shape_precision, self._shape))
+        cost, log_widths = 0.0, 0.0
+        for index, unit, width in parts:
+            precision = unit / width**2
             pull = precision @ base.values[index]
             information[np.ix_(index, index)] += precision
             gradient[index] += pull
             cost += 0.5 * float(base.values[index] @ pull)
+            log_widths += len(index) * float(np.log(width))
         self._inner = np.concatenate([g for own in base.groups.values() for g in own])
         self._outer = np.setdiff1d(np.arange(len(gradient)), self._inner)
         inner, outer = self._inner, self._outer
@@ -157,9 +176,9 @@ class _Field:
         log_det = 2.0 * float(np.log(np.diag(self._factor[0])).sum())
         cost += 0.5 * float(gradient[outer] @ self._outer_step)
         self._constant = -cost - 0.5 * log_det
-        self._constant -= FIELD * len(base.fields) * float(np.log(field_per_m))
+        self._constant -= log_widths
         self._values = base.values[inner]
-        self._options = [options(name, len(base.cameras)) for name in CLASSES]
+        self._options = [width_options(name, len(base.cameras)) for name in CLASSES]
         self._precisions = [
             np.stack([self._precision(name, option) for option in own])
             for name, own in zip(CLASSES, self._options, strict=True)
@@ -175,7 +194,7 @@ class _Field:
             name: tuple(levels[place] for levels in chosen[: len(SENSOR)])
             for place, name in enumerate(self._base.cameras)
         }
-        return Widths(sensors, self._field_per_m, chosen[-2][0], chosen[-1][0])
+        return Widths(sensors, self._field_per_m, self._shape, chosen[-2][0], chosen[-1][0])
 
     def log_evidence(self) -> float:
         """Log of the sum over all choices that were visited."""

@@ -7,12 +7,13 @@ depth w, the sensor's parameters theta (`sensor_model`) and the expected inverse
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.ball_shape import SHAPE, shape_terms
 from station.calibration.adjust.problem import Sightings, Surface
 from station.calibration.adjust.sensor_model import SensorModel
 from station.calibration.detect.ball_image import ball_inverse_depth
@@ -34,17 +35,27 @@ _HUBER = 3.0
 
 @dataclass(frozen=True, slots=True)
 class BallEquations:
-    """Normal equations of (centre, radius; theta) of n detections, H (n, 4, 4) and so on.
+    """Normal equations of (centre, radius, shape; theta) of n detections, H (n, 9, 9) and so on.
 
-    ``theta_matrix`` (U, U) and ``theta_gradient`` (U,) are summed over the detections.
+    Centre and shape are in the camera's frame. ``theta_matrix`` (U, U) and ``theta_gradient``
+    (U,) are summed over the detections.
     """
 
     matrix: Array
     gradient: Array
     mixed: Array
-    """(n, 4, U)"""
+    """(n, 9, U)"""
     theta_matrix: Array
     theta_gradient: Array
+
+    def of_sphere(self) -> BallEquations:
+        """The equations (n, 4, 4) without the shape."""
+        return replace(
+            self,
+            matrix=self.matrix[:, :4, :4],
+            gradient=self.gradient[:, :4],
+            mixed=self.mixed[:, :4],
+        )
 
     def summed(self) -> BallEquations:
         """The sum over all detections, for a ball at rest."""
@@ -60,21 +71,23 @@ class BallEquations:
         """The equations with a tremor and a radius error of each detection marginalised.
 
         The four nuisance parameters d with prior information L are eliminated: H becomes
-        H - H (H + L)^-1 H, and so on. ``trust`` (n,) is what the equations were weighed by.
+        H - H_d^T (H_dd + L)^-1 H_d with the rows H_d of centre and radius, and so on. ``trust``
+        (n,) is what the equations were weighed by.
         """
         prior = np.diag(np.array([*[TREMOR_M] * 3, ROUNDNESS * radius_m]) ** -2.0)
         weighed = np.maximum(trust, _NO_TRUST)[:, None, None] * prior
-        inverse = np.linalg.inv(self.matrix + weighed)
-        taken = self.matrix @ inverse
-        half = np.swapaxes(np.linalg.cholesky(inverse), 1, 2) @ self.mixed
+        matrix, gradient, mixed = self.matrix[:, :4], self.gradient[:, :4], self.mixed[:, :4]
+        inverse = np.linalg.inv(matrix[:, :, :4] + weighed)
+        taken = np.swapaxes(matrix, 1, 2) @ inverse
+        half = np.swapaxes(np.linalg.cholesky(inverse), 1, 2) @ mixed
         flat = half.reshape(4 * len(half), half.shape[-1])
         return BallEquations(
-            self.matrix - taken @ self.matrix,
-            self.gradient - np.einsum("nij,nj->ni", taken, self.gradient),
-            self.mixed - taken @ self.mixed,
+            self.matrix - taken @ matrix,
+            self.gradient - np.einsum("nij,nj->ni", taken, gradient),
+            self.mixed - taken @ mixed,
             self.theta_matrix - flat.T @ flat,
             self.theta_gradient
-            - np.einsum("niu,nij,nj->u", self.mixed, inverse, self.gradient, optimize=True),
+            - np.einsum("niu,nij,nj->u", mixed, inverse, gradient, optimize=True),
         )
 
     def moved(self, shift: Array) -> BallEquations:
@@ -90,9 +103,10 @@ class BallEquations:
 
 def center_equations(seen: Sightings, rows: BallRows) -> tuple[Array, Array]:
     """H (n, 4, 4) and gradient (n, 4) of centre and radius, without the sensor's parameters."""
-    weighted = rows.jacobian * seen.weight[..., None]
+    jacobian = rows.jacobian[..., :4]
+    weighted = jacobian * seen.weight[..., None]
     return (
-        np.swapaxes(weighted, 1, 2) @ rows.jacobian,
+        np.swapaxes(weighted, 1, 2) @ jacobian,
         np.einsum("nki,nk->ni", weighted, rows.residual),
     )
 
@@ -112,20 +126,27 @@ def ball_equations(
         np.swapaxes(weighted, 1, 2) @ rows.jacobian,
         np.einsum("nki,nk->ni", weighted, rows.residual),
         *design.products(
-            model.size, rows.jacobian.reshape(-1, 4), weight.ravel(), rows.residual.ravel(), patches
+            model.size,
+            rows.jacobian.reshape(-1, 4 + SHAPE),
+            weight.ravel(),
+            rows.residual.ravel(),
+            patches,
         ),
     )
 
 
 def corrected_centers(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, parameters: Array,
-    radius_m: float,
+    radius_m: float, shape: Array,
 ) -> Array:  # fmt: skip
-    """Centres (n, 3) of the detections, each estimated alone, with the sensor's corrections."""
+    """Centres (n, 3) of the detections, each estimated alone, with the sensor's corrections.
+
+    ``shape`` (n, 5) is the ball's in the camera's frame.
+    """
     centers = seen.centers.copy()
     ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
     for _ in range(4):
-        rows = _rows_along(ray, seen, model, centers, parameters, radius_m)
+        rows = _rows_along(ray, seen, model, centers, parameters, radius_m, shape)
         matrix, gradient = center_equations(seen, rows)
         centers -= np.linalg.solve(matrix[:, :3, :3], gradient[:, :3, None])[..., 0]
     return centers
@@ -139,7 +160,7 @@ class BallRows:
     expected: Array
     """Measured inverse depth as it is expected."""
     jacobian: Array
-    """(n, k, 4) by centre and radius."""
+    """(n, k, 9) by centre, radius and shape."""
     ray: Array
     by_ray: Array
     """(n, k, 2): derivative of the ball's inverse depth."""
@@ -149,24 +170,29 @@ class BallRows:
 
 def ball_rows(
     seen: Sightings, camera: CameraCalibration, model: SensorModel, centers: Array,
-    parameters: Array, radius_m: float,
+    parameters: Array, radius_m: float, shape: Array,
 ) -> BallRows:  # fmt: skip
-    """Rows of balls with centres (n, 3), through a sensor with its parameters (U,)."""
+    """Rows of balls with centres (n, 3), through a sensor with its parameters (U,).
+
+    ``shape`` (n, 5) is the ball's in the camera's frame.
+    """
     ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
-    return _rows_along(ray, seen, model, centers, parameters, radius_m)
+    return _rows_along(ray, seen, model, centers, parameters, radius_m, shape)
 
 
 def _rows_along(
     ray: Array, seen: Sightings, model: SensorModel, centers: Array, parameters: Array,
-    radius_m: float,
+    radius_m: float, shape: Array,
 ) -> BallRows:  # fmt: skip
     w, gradient = ball_inverse_depth(centers, ray, radius_m)
     # A side that is flatter by k stands k R (1 - cos^2) higher where it is so far off its middle.
     towards = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) / w[..., None]
-    apart = np.einsum("nki,ni->nk", towards - centers[:, None], centers)
-    cosine = apart / (radius_m * np.linalg.norm(centers, axis=1)[:, None])
-    flatter = gradient[..., 3] * radius_m * (1.0 - np.minimum(cosine**2, 1.0))
-    w = w + model.flattening(parameters) * flatter
+    normals = (towards - centers[:, None]) / radius_m
+    cosine = np.einsum("nki,ni->nk", normals, centers) / np.linalg.norm(centers, axis=1)[:, None]
+    higher = gradient[..., 3] * radius_m
+    flatter = higher * (1.0 - np.minimum(cosine**2, 1.0))
+    shaped = higher[..., None] * shape_terms(normals)
+    w = w + model.flattening(parameters) * flatter + np.einsum("nkm,nm->nk", shaped, shape)
     place = seen.place.reshape(-1, 2)
     flat = w.ravel()
     expected = flat - model.change(parameters, flat, place)
@@ -174,7 +200,7 @@ def _rows_along(
     return BallRows(
         seen.inverse + change - w,
         expected.reshape(w.shape),
-        -gradient[..., :4],
+        -np.concatenate([gradient[..., :4], shaped], axis=2),
         ray,
         gradient[..., 4:],
         flatter,
@@ -183,14 +209,14 @@ def _rows_along(
 
 @dataclass(frozen=True, slots=True)
 class PlaneEquations:
-    """Normal equations of (plane m, bow) (10) and theta (U) of one view of a surface."""
+    """Normal equations of (plane m, bow) (12) and theta (U) of one view of a surface."""
 
     matrix: Array
-    """(10, 10)"""
+    """(12, 12)"""
     gradient: Array
-    """(10,)"""
+    """(12,)"""
     mixed: Array
-    """(10, U)"""
+    """(12, U)"""
     theta_matrix: Array
     theta_gradient: Array
 
@@ -199,7 +225,7 @@ def plane_equations(
     surface: Surface, camera: CameraCalibration, model: SensorModel, plane: Array,
     parameters: Array, bow: Array,
 ) -> PlaneEquations:  # fmt: skip
-    """Equations at a plane m (3,) and a bow (7,), which only floors have."""
+    """Equations at a plane m (3,) and a bow (9,), which only floors have."""
     ray = pixel_rays(model.camera(camera, parameters), surface.pixels)
     towards = np.column_stack([ray, np.ones(len(ray))])
     w = towards @ plane
@@ -301,9 +327,13 @@ def _design(
 
 
 def bow_terms(points: Array, mark: Array, up: Array) -> Array:
-    """Terms (n, 7) of the floor's bow at points (n, 3), about the mark."""
+    """Terms (n, 9) of the floor's bow at points (n, 3), about the mark.
+
+    The plane takes up the linear ones: with them, it is the level of the whole floor and not that
+    of the floor at the mark, and its slope is known no better than a bowed floor leans there.
+    """
     first = np.cross(up, (1.0, 0.0, 0.0))
     first /= np.linalg.norm(first)
     away = points - mark
     x, y = away @ first, away @ np.cross(up, first)
-    return np.stack([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=-1)
+    return np.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=-1)

@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
-from scipy.sparse import csr_matrix
+from scipy.sparse import bsr_matrix, csr_matrix
 
+from station.calibration.adjust.ball_shape import SHAPE, shape_terms, shape_turn
 from station.calibration.adjust.equations import (
     BallEquations,
     ball_equations,
     plane_equations,
 )
+from station.calibration.adjust.priors import priors
 from station.calibration.adjust.problem import (
     BOW_SIZE,
     POSE_AND_CLOCK,
@@ -28,7 +30,6 @@ from station.calibration.adjust.problem import (
     Sightings,
     State,
     Surface,
-    priors,
 )
 from station.calibration.adjust.residuals import DetectionResiduals
 from station.calibration.adjust.trajectory import path_points
@@ -44,6 +45,9 @@ TAPE_M = 0.001
 """Standard deviation of a height that was measured with a tape."""
 _TAIL = 4.0
 """Degrees of freedom (Student's t) of a contact: the ball may lie on something else."""
+_STAND_TAIL = 20.0
+"""Of a measured height, which is hardly wrong: sensors whose errors have an unexpected form must
+not push it aside."""
 
 
 class NormalEquations:
@@ -135,9 +139,12 @@ class NormalEquations:
         chain[:, 3, 7] = 1.0
         index = np.concatenate([layout.camera(name)[:POSE_AND_CLOCK], layout.radius])
         sensor = layout.sensor(name)
+        path = _spline_rows(first, value, pose[:3, :3].T, state.grid.count)
+        if self._problem.shape_grid.count:
+            self._add_shape(seen, balls, chain, index, path)
+        balls = balls.of_sphere()
         self._add_balls(balls, chain, index, sensor)
         carried = balls.matrix @ chain
-        path = _path_rows(first, value, pose[:3, :3], state.grid.count)
         border = np.concatenate([carried[:, :3], balls.mixed[:, :3]], axis=2)
         coupling = path.T @ border.reshape(-1, border.shape[2])
         columns = np.concatenate([index, sensor])
@@ -145,6 +152,26 @@ class NormalEquations:
         self._coupling[columns[kept]] += coupling.T[kept]
         self._path_gradient += path.T @ balls.gradient[:, :3].ravel()
         self._add_band(first, value, pose[:3, :3] @ balls.matrix[:, :3, :3] @ pose[:3, :3].T)
+
+    def _add_shape(
+        self, seen: Sightings, balls: BallEquations, chain: Array, index: Indices, path: csr_matrix
+    ) -> None:
+        """The waved ball's shape, with its products with all else."""
+        layout, state, name = self._layout, self._state, seen.camera
+        grid, own = self._problem.shape_grid, layout.waved_shape
+        first, value, _ = grid.basis(seen.times_s + state.clock_s[name])
+        turn = shape_turn(state.poses[name][:3, :3].T)
+        rows = _spline_rows(first, value, turn, grid.count)
+        self._border[own, own] += (rows.T @ _blocks(balls.matrix[:, 4:, 4:]) @ rows).toarray()
+        self._gradient[own] += rows.T @ balls.gradient[:, 4:].ravel()
+        kept, sensor = index >= 0, layout.sensor(name)
+        columns = np.concatenate([index[kept], sensor])
+        carried = balls.matrix[:, 4:, :4] @ chain[..., kept]
+        mixed = np.concatenate([carried, balls.mixed[:, 4:]], axis=2)
+        product = rows.T @ mixed.reshape(-1, mixed.shape[2])
+        self._border[own, columns] += product
+        self._border[columns, own] += product.T
+        self._coupling[own] += (rows.T @ _blocks(balls.matrix[:, 4:, :3]) @ path).toarray()
 
     def _add_band(self, first: Indices, value: Array, matrix: Array) -> None:
         """Information (n, 3, 3) of points on the path, reference frame."""
@@ -163,16 +190,27 @@ class NormalEquations:
         pose, detections = state.poses[name], len(seen.times_s)
         center = (state.places[place] - pose[:3, 3]) @ pose[:3, :3]
         centers = np.repeat(center[None], detections, axis=0)
-        residuals = DetectionResiduals.at_rest(self._problem, state, seen, centers)
+        turn = shape_turn(pose[:3, :3].T)
+        shape = turn @ state.place_shapes.get(place, np.zeros(SHAPE))
+        shapes = np.repeat(shape[None], detections, axis=0)
+        residuals = DetectionResiduals.at_rest(self._problem, state, seen, centers, shapes)
         # Detections of a still ball share the part of the noise that does not change.
         trust = self._trust * residuals.robust / (FROZEN_SHARE * detections + 1.0 - FROZEN_SHARE)
         balls = self._balls(seen, residuals, trust).summed()
         balls = balls.marginalised(self._problem.radius_m, np.array([self._trust]))
-        chain = np.zeros((1, 4, 6 + 3 + 1))
+        chain = np.zeros((1, 4 + SHAPE, 6 + 3 + 1 + SHAPE))
         chain[0, :3, :3], chain[0, :3, 3:6] = skew(center), -np.eye(3)
         chain[0, :3, 6:9] = pose[:3, :3].T
         chain[0, 3, 9] = 1.0
-        index = np.concatenate([layout.camera(name)[:6], layout.triple(place), layout.radius])
+        chain[0, 4:, 10:] = turn
+        index = np.concatenate(
+            [
+                layout.camera(name)[:6],
+                layout.triple(place),
+                layout.radius,
+                layout.place_shape(place),
+            ]
+        )
         self._add_balls(balls, chain, index, layout.sensor(name))
 
     def _add_balls(
@@ -225,27 +263,65 @@ class NormalEquations:
         problem, layout, state = self._problem, self._layout, self._state
         at, q = state.places[place], state.planes[FLOOR]
         length = np.linalg.norm(q)
-        height_m = problem.heights_m.get(place, 0.0)
         above = (1.0 - q @ at) / length
         terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))
-        off_m = above - terms @ state.bow - state.radius_m - height_m
-        row = np.concatenate([-q / length, -at / length - above * q / length**2, [-1.0], -terms])
-        index = np.concatenate(
-            [layout.triple(place), layout.triple(FLOOR), layout.radius, layout.bow]
+        off_m = contact_error_m(problem, state, place)
+        row = np.concatenate(
+            [
+                -q / length,
+                -at / length - above * q / length**2,
+                [-1.0],
+                -terms,
+                -state.radius_m * shape_terms(q / length),
+            ]
         )
+        index = np.concatenate(
+            [
+                layout.triple(place),
+                layout.triple(FLOOR),
+                layout.radius,
+                layout.bow,
+                layout.place_shape(place),
+            ]
+        )
+        row, index = row[index >= 0], index[index >= 0]
         sigma_m = np.hypot(CONTACT_M, TAPE_M) if place in problem.heights_m else CONTACT_M
         # A ball that lies on something else is refused later: it must not tilt the floor.
-        weight = sigma_m**-2.0 * _TAIL / (_TAIL + (off_m / sigma_m) ** 2)
+        tail = _STAND_TAIL if place in problem.heights_m else _TAIL
+        weight = sigma_m**-2.0 * tail / (tail + (off_m / sigma_m) ** 2)
         self._border[np.ix_(index, index)] += weight * np.outer(row, row)
         self._gradient[index] += weight * off_m * row
 
 
-def _path_rows(first: Indices, value: Array, rotation: Array, count: int) -> csr_matrix:
-    """Derivatives of centres in the camera (3 n) by control points (3 count)."""
-    data = value[:, None, :, None] * rotation.T[None, :, None, :]
-    column = 3 * first[:, None, None, None] + np.arange(12).reshape(1, 1, 4, 3)
+def contact_error_m(problem: Problem, state: State, place: str) -> float:
+    """How much higher a ball rests than where it touches the floor or its stand."""
+    q = state.planes[FLOOR]
+    length = np.linalg.norm(q)
+    terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))
+    # The underside of a ball that is not round stands off the sphere as its top does.
+    shape = state.place_shapes.get(place, np.zeros(SHAPE))
+    radius_m = state.radius_m * (1.0 + shape_terms(q / length) @ shape)
+    above = (1.0 - q @ state.places[place]) / length
+    return float(above - terms @ state.bow - radius_m - problem.heights_m.get(place, 0.0))
+
+
+def _spline_rows(first: Indices, value: Array, turn: Array, count: int) -> csr_matrix:
+    """Derivatives (d n, d count) of values (n, d), turned by a matrix (d, d), by control points."""
+    size = len(turn)
+    data = value[:, None, :, None] * turn[None, :, None, :]
+    column = size * first[:, None, None, None] + np.arange(4 * size).reshape(1, 1, 4, size)
     column = np.broadcast_to(column, data.shape)
-    rows = 3 * len(first)
+    rows, every = size * len(first), 4 * size
     return csr_matrix(
-        (data.ravel(), column.ravel(), np.arange(0, 12 * rows + 1, 12)), shape=(rows, 3 * count)
+        (data.ravel(), column.ravel(), np.arange(0, every * rows + 1, every)),
+        shape=(rows, size * count),
+    )
+
+
+def _blocks(matrices: Array) -> bsr_matrix:
+    """Matrices (n, a, b) along a diagonal."""
+    count, high, wide = matrices.shape
+    return bsr_matrix(
+        (np.ascontiguousarray(matrices), np.arange(count), np.arange(count + 1)),
+        shape=(count * high, count * wide),
     )

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.sensor_model import FULL, SensorModel, image_place
+from station.calibration.adjust.ball_shape import SHAPE, shape_turn
+from station.calibration.adjust.sensor_model import (
+    FULL,
+    SensorModel,
+    image_place,
+)
 from station.calibration.adjust.trajectory import TimeGrid
-from station.calibration.adjust.widths import BOW, BOW_TOLERANCE, RADIUS, Widths, sigma
+from station.calibration.adjust.widths import Widths
 from station.calibration.detect.detections import FLOOR, BallDetection, PlaneObservation
 from station.core.geometry import se3_exp
 from station.core.lens import pixel_rays
@@ -21,8 +26,12 @@ Indices = NDArray[np.int64]
 
 POSE_AND_CLOCK = 7
 """Pose (6) and clock (1) come before a camera's sensor parameters."""
-BOW_SIZE = 7
-"""Terms of the floor's bow: x^2, x y, y^2, x^3, x^2 y, x y^2, y^3 about the mark."""
+BOW_SIZE = 9
+"""Terms of the floor's bow about the mark: x, y, x^2, x y, y^2, x^3, x^2 y, x y^2, y^3."""
+ROUND = TimeGrid(0.0, 0)
+SHAPE_KNOT_S = 2.5
+"""Somebody who walks around the mark with a ball turns it by less than half a right angle
+meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +96,7 @@ class Surface:
     plane: Array
     """m (3,) of 1/z = m . (x, y, 1) through the readings, uncorrected."""
     bow_terms: Array | None = None
-    """(n, 7) of a floor that may be bowed."""
+    """(n, 9) of a floor that may be bowed."""
 
     @classmethod
     def of(cls, camera: CameraCalibration, seen: PlaneObservation, name: str) -> Surface:
@@ -118,8 +127,11 @@ class Problem:
     """Measured height of the ball's underside above the floor at a place; the floor itself where a
     place is not named."""
     bow_terms: Mapping[str, Array] = field(default_factory=dict)
-    """(7,) of the floor below each place."""
+    """(9,) of the floor below each place."""
     model: SensorModel = FULL
+    shape_grid: TimeGrid = ROUND
+    """Times between which the shape of the waved ball changes; ``ROUND`` for a ball that is a
+    sphere."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +153,11 @@ class State:
     """q (3,) of q . X = 1."""
     radius_m: float
     bow: Array = field(default_factory=lambda: np.zeros(BOW_SIZE))
-    """Coefficients (7,) of the floor's bow, metres at 1 m from the mark."""
+    """Coefficients (9,) of the floor's bow, metres at 1 m from the mark."""
+    shape: Array = field(default_factory=lambda: np.zeros((0, SHAPE)))
+    """Control points (k, 5) of the waved ball's shape, reference frame; by ``shape_grid``."""
+    place_shapes: Mapping[str, Array] = field(default_factory=dict)
+    """The resting ball's shape (5,), reference frame."""
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Information of the border's unknowns, priors included; empty unless asked for."""
     gradient: Array = field(default_factory=lambda: np.zeros(0))
@@ -166,6 +182,9 @@ class Layout:
     reference: str
     cameras: frozenset[str]
     per_camera: int
+    waved_shape: slice
+    place_shapes: Mapping[str, int]
+    """Start of each place's shape; none of a ball that is a sphere."""
 
     @classmethod
     def of(cls, problem: Problem) -> Layout:
@@ -180,9 +199,16 @@ class Layout:
         for name in (*problem.resting, *surfaces):
             starts[name] = size
             size += 3
+        waved_shape = slice(size, size + SHAPE * problem.shape_grid.count)
+        size = waved_shape.stop
+        place_shapes = {}
+        for name in problem.resting if problem.shape_grid.count else ():
+            place_shapes[name] = size
+            size += SHAPE
         return cls(
-            starts, size + 1 + BOW_SIZE, problem.reference, frozenset(problem.cameras), per_camera
-        )
+            starts, size + 1 + BOW_SIZE, problem.reference, frozenset(problem.cameras), per_camera,
+            waved_shape, place_shapes,
+        )  # fmt: skip
 
     def camera(self, name: str) -> Indices:
         """Indices of pose, clock and sensor parameters; -1 where they are fixed."""
@@ -199,6 +225,17 @@ class Layout:
         """Indices (3,) of a place or plane."""
         return np.arange(3) + self.starts[name]
 
+    def place_shape(self, name: str) -> Indices:
+        """Indices (5,) of the shape of the ball at a place; -1 of a ball that is a sphere."""
+        start = self.place_shapes.get(name)
+        return np.full(SHAPE, -1) if start is None else np.arange(SHAPE) + start
+
+    @property
+    def shapes(self) -> Indices:
+        """Indices of all shapes."""
+        start = self.waved_shape.start
+        return np.arange(start, self.waved_shape.stop + SHAPE * len(self.place_shapes))
+
     @property
     def radius(self) -> Indices:
         """Index (1,) of the ball's radius."""
@@ -206,7 +243,7 @@ class Layout:
 
     @property
     def bow(self) -> Indices:
-        """Indices (7,) of the floor's bow."""
+        """Indices (9,) of the floor's bow."""
         return np.arange(self.size - BOW_SIZE, self.size)
 
     @property
@@ -220,36 +257,14 @@ class Layout:
         return np.asarray(index[index >= 0])
 
 
-CLOCK_TOLERANCE_S = 0.005
-"""Standard deviation of one camera's clock against another's, before it is solved for."""
-
-
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """Prior of some unknowns of the border, a normal distribution."""
-
-    index: Indices
-    information: Array
-    """(k, k)"""
-    values: Array
-    """(k,) deviations of the unknowns from its mean."""
-
-
-def priors(problem: Problem, layout: Layout, state: State) -> Iterator[Prior]:
-    """All priors of a problem at a state."""
-    widths = problem.widths
-    for name in problem.cameras:
-        own = state.sensors[name]
-        information = problem.model.prior(own, widths.sensor(name), widths.field_per_m)
-        yield Prior(layout.sensor(name), information, own)
-        if name != layout.reference:
-            clock = np.array([[CLOCK_TOLERANCE_S**-2.0]])
-            yield Prior(layout.camera(name)[6:7], clock, np.array([state.clock_s[name]]))
-    radius_sigma_m = sigma(RADIUS, widths.radius) * problem.radius_m
-    off_m = np.array([state.radius_m - problem.radius_m])
-    yield Prior(layout.radius, np.array([[radius_sigma_m**-2.0]]), off_m)
-    bow_sigma = sigma(BOW, widths.bow) * BOW_TOLERANCE
-    yield Prior(layout.bow, np.diag(bow_sigma**-2.0), state.bow)
+def seen_shape(problem: Problem, state: State, camera: str, times_s: Array) -> Array:
+    """Shape (n, 5) of the waved ball in a camera's frame, at times of the camera's clock."""
+    if not problem.shape_grid.count:
+        return np.zeros((len(times_s), SHAPE))
+    first, value, _ = problem.shape_grid.basis(times_s + state.clock_s[camera])
+    controls = state.shape[first[:, None] + np.arange(4)]
+    turn = shape_turn(state.poses[camera][:3, :3].T)
+    return np.einsum("nk,nkm->nm", value, controls) @ turn.T
 
 
 def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> State:
@@ -270,4 +285,8 @@ def moved_state(problem: Problem, layout: Layout, state: State, step: Array) -> 
         planes={name: q + step[layout.triple(name)] for name, q in state.planes.items()},
         radius_m=state.radius_m + float(step[layout.radius][0]),
         bow=state.bow + step[layout.bow],
+        shape=state.shape + step[layout.waved_shape].reshape(state.shape.shape),
+        place_shapes={
+            name: own + step[layout.place_shape(name)] for name, own in state.place_shapes.items()
+        },
     )

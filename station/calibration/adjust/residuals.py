@@ -14,7 +14,7 @@ from station.calibration.adjust.equations import (
     ball_rows,
     center_equations,
 )
-from station.calibration.adjust.problem import Indices, Problem, Sightings, State
+from station.calibration.adjust.problem import Indices, Problem, Sightings, State, seen_shape
 from station.calibration.adjust.trajectory import path_points
 
 Array = NDArray[np.float64]
@@ -59,17 +59,18 @@ class DetectionResiduals:
         basis = state.grid.basis(seen.times_s + state.clock_s[seen.camera])
         centers = (path_points(state.controls, *basis[:2]) - pose[:3, 3]) @ pose[:3, :3]
         near = _near(centers, seen.centers)
-        rows = _rows(problem, state, seen, near)
+        shape = seen_shape(problem, state, seen.camera, seen.times_s)
+        rows = _rows(problem, state, seen, near, shape)
         balls = _without_sensor(seen, rows).moved(centers - near)
         deviation = _deviation(balls.marginalised(problem.radius_m, np.ones(len(centers))))
         return cls(centers, near, rows, deviation, _robust_weight(deviation), *basis)
 
     @classmethod
     def at_rest(
-        cls, problem: Problem, state: State, seen: Sightings, centers: Array
+        cls, problem: Problem, state: State, seen: Sightings, centers: Array, shape: Array
     ) -> DetectionResiduals:
-        """Detections of a ball that rests."""
-        rows = _rows(problem, state, seen, centers)
+        """Detections of a ball that rests; its shape (n, 5) in the camera's frame."""
+        rows = _rows(problem, state, seen, centers, shape)
         deviation = _deviation(_without_sensor(seen, rows))
         basis = (np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros((0, 4)))
         return cls(centers, centers, rows, deviation, _robust_weight(deviation), *basis)
@@ -100,11 +101,14 @@ class FitQuality:
         return cls(deviations, float(np.sqrt(cost / max(3.0 * count - unknowns, 1.0))))
 
 
-def _rows(problem: Problem, state: State, seen: Sightings, centers: Array) -> BallRows:
+def _rows(
+    problem: Problem, state: State, seen: Sightings, centers: Array, shape: Array
+) -> BallRows:
     name = seen.camera
     return ball_rows(
-        seen, problem.cameras[name], problem.model, centers, state.sensors[name], state.radius_m
-    )
+        seen, problem.cameras[name], problem.model, centers, state.sensors[name], state.radius_m,
+        shape,
+    )  # fmt: skip
 
 
 def _without_sensor(seen: Sightings, rows: BallRows) -> BallEquations:

@@ -1,8 +1,9 @@
 """The errors of one sensor that a calibration solves for: depth and lens.
 
-Inverse depth: 1/z_true = w + p0 + p1 w + p2 (w - w0)^2 + p3 x + p4 y + f(x, y, w), with
+Inverse depth: 1/z_true = w + p0 + p1 w + p2 (w - w0)^2 + p3 x + p4 y + p5 L(w) + f(x, y, w), with
 w = 1/z_measured and x, y from -1 to 1 over the image. p0 is a shift of the disparity, p1 a wrong
-baseline, p3 and p4 a projector that is turned against its camera; f is a smooth field of tensor
+baseline, p3 and p4 a projector that is turned against its camera, p5 L a share of the difference
+between two laws by which raw readings become depths; f is a smooth field of tensor
 B-splines (`station.core.depth_image`) with a Gaussian-process prior. Lens: the focal length's
 relative error, the principal point's shift (pixels) and the radial coefficient k1. Ball: how much
 flatter the side of it that the camera sees is than a sphere, a share of its radius.
@@ -18,17 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth_image import DepthField, linear_basis, quadratic_basis
+from station.core.kinect_v1 import registration_law
 from station.core.rig import CameraCalibration, DepthCorrection
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-POLYNOMIAL, LENS, BALL = 5, 4, 1
+POLYNOMIAL, LENS, BALL = 6, 4, 1
+LAW = 5
+"""Index of p5."""
 MIDDLE = 0.6
 """w0, 1/m: the middle of a booth's depths."""
-TOLERANCE = np.array([5e-3, np.inf, 1.5e-3, 2e-3, 2e-3])
+TOLERANCE = np.array([5e-3, np.inf, 1.5e-3, 2e-3, 2e-3, np.inf])
 """Standard deviations of p0..p4 among sensors as they leave the factory; of the gain p1, and of the
-lens, see `station.calibration.adjust.widths`."""
+lens, see `station.calibration.adjust.widths`; of p5, which all sensors share but for a little, see
+`LAW_SIGMA`."""
+LAW_SIGMA, LAW_DIFFERENCE = 1.0, 0.02
+"""Standard deviations of p5, and of its difference from one sensor to another: it is 0 by the
+tangent law and 1 by that of libfreenect's registration, whose constants units state alike."""
 TAIL = 4.0
 """Degrees of freedom (Student's t) of the polynomial's prior."""
 _COLUMNS, _ROWS = 9, 7
@@ -40,6 +48,17 @@ _WIDTH_OF = np.array([0, 1, 2, 2, 3, 4])
 """Class of gain, focal length, centre (twice), k1 and flattening."""
 _FIELD_REACH, _FIELD_REACH_W = 0.35, 0.5
 """Correlation lengths: of a half image (110 px), and of inverse depth (1/m)."""
+
+
+def _law_difference() -> Array:
+    """Coefficients of L(w), a polynomial in w that is exact to 3e-6 1/m from 0.5 to 4 m."""
+    inverse = np.linspace(0.25, 2.0, 100)
+    return np.asarray(
+        np.polynomial.polynomial.polyfit(inverse, registration_law(inverse) - inverse, 4)
+    )
+
+
+_LAW = _law_difference()
 
 
 def image_place(camera: CameraCalibration, pixels: Array) -> Array:
@@ -108,7 +127,7 @@ class SensorModel:
         return whole
 
     def polynomial_design(self, inverse: Array, place: Array) -> Array:
-        """Derivatives (n, 5) of corrected inverse depths by p0..p4.
+        """Derivatives (n, 6) of corrected inverse depths by p0..p5.
 
         To be taken at expected inverse depths: noise on both sides of an equation biases it.
         """
@@ -119,6 +138,7 @@ class SensorModel:
                 (inverse - MIDDLE) ** 2,
                 place[..., 0],
                 place[..., 1],
+                np.polynomial.polynomial.polyval(inverse, _LAW),
             ],
             axis=-1,
         )
@@ -177,13 +197,14 @@ class SensorModel:
 
     def correction(self, parameters: Array) -> DepthCorrection:
         """The depth correction as the calibration file has it."""
-        p0, p1, p2, gx, gy = (float(value) for value in parameters[:POLYNOMIAL])
+        p0, p1, p2, gx, gy, p5 = (float(value) for value in parameters[:POLYNOMIAL])
         field = None
         if self.field:
             control = parameters[self.field_start :].reshape(len(_KNOTS), _ROWS, _COLUMNS)
             field = DepthField(_KNOTS, control.copy())
-        coefficients = (p0 + p2 * MIDDLE**2, 1.0 + p1 - 2.0 * p2 * MIDDLE, p2)
-        return DepthCorrection(coefficients, (gx, gy), field)
+        coefficients = p5 * _LAW
+        coefficients[:3] += (p0 + p2 * MIDDLE**2, 1.0 + p1 - 2.0 * p2 * MIDDLE, p2)
+        return DepthCorrection(tuple(coefficients.tolist()), (gx, gy), field)
 
 
 @numba.njit(cache=True, nogil=True)

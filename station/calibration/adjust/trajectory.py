@@ -30,27 +30,29 @@ class TimeGrid:
     start_s: float
     count: int
     """Control points."""
+    knot_s: float = KNOT_S
 
     @classmethod
-    def over(cls, times_s: Array, margin_s: float = KNOT_S) -> TimeGrid:
+    def over(cls, times_s: Array, margin_s: float = KNOT_S, knot_s: float = KNOT_S) -> TimeGrid:
         """Knots that cover all times and a margin."""
         start = float(times_s.min()) - margin_s
-        return cls(start, int(np.ceil((times_s.max() + margin_s - start) / KNOT_S)) + 3)
+        count = int(np.ceil((times_s.max() + margin_s - start) / knot_s)) + 3
+        return cls(start, count, knot_s)
 
     def basis(self, times_s: Array) -> tuple[Indices, Array, Array]:
         """First control point (n,), weights (n, 4) of it and the next three, and their rates."""
-        x = (times_s - self.start_s) / KNOT_S
+        x = (times_s - self.start_s) / self.knot_s
         first = np.clip(np.floor(x), 0, self.count - 4).astype(np.int64)
         s = x - first
         one = np.ones_like(s)
         powers = np.stack([one, s, s**2, s**3], axis=1)
-        rates = np.stack([0 * s, one, 2 * s, 3 * s**2], axis=1) / KNOT_S
+        rates = np.stack([0 * s, one, 2 * s, 3 * s**2], axis=1) / self.knot_s
         return first, powers @ _BASIS, rates @ _BASIS
 
     def smoothness(self) -> Array:
         """Upper band (3, count) of the acceleration's information, one axis."""
         band = np.zeros((3, self.count))
-        weight = KNOT_S**-4 / ACCELERATION_M_S2**2
+        weight = self.knot_s**-4 / ACCELERATION_M_S2**2
         for offset, values in ((0, (1.0, 4.0, 1.0)), (1, (-2.0, -2.0)), (2, (1.0,))):
             for place, value in enumerate(values):
                 start = place + offset

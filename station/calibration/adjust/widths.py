@@ -36,12 +36,16 @@ _ENDS: Mapping[str, tuple[float, float]] = {
 (px) and k1: what a checkerboard calibration repeats to, and what units differ by (Herrera, Kannala
 & Heikkila 2012; Smisek, Jancosek & Pajdla 2011). Flattening and radius (relative): a turned ball,
 and one made for play. Bow: a share of ``BOW_TOLERANCE``."""
-BOW_TOLERANCE = np.array([1.5e-3] * 3 + [0.7e-3] * 4)
+BOW_TOLERANCE = np.array([1.2e-3] * 2 + [1.5e-3] * 3 + [0.7e-3] * 4)
 """Standard deviations of a bowed floor, metres at 1 m: DIN 18202 lets a finished floor be off by
-4 mm over 1 m."""
+4 mm over 1 m. A wave of 2 mm that is 4 m long leans by 1.2 mm over 1 m, rms, near its crest."""
 FIELD_LEVELS = 6e-5 * 2.0 ** np.arange(6)
 """Standard deviations of the depth fields, 1/m: 0.2 mm to 6 mm at 1.8 m; after a polynomial
 correction a Kinect's depth error leaves 2 mm (Herrera, Kannala & Heikkila 2012)."""
+SHAPE_LEVELS = (3e-4, 1.4e-3, 6e-3)
+"""Standard deviations of the coefficients of a ball's shape: a ball that is longer along one axis
+by the share e has coefficients of 0.37 e, rms. Of a turned ball, and of one made for play (up to
+1.6 %)."""
 _SOUND = 0.6
 """Probability that a class is as in sound units, before anything is seen."""
 _ALONE = 0.1
@@ -61,6 +65,8 @@ class Widths:
     sensors: Mapping[str, tuple[int, ...]]
     """Level of each class of ``SENSOR`` by camera."""
     field_per_m: float
+    shape: float
+    """Standard deviation of each coefficient of the ball's shape."""
     radius: int
     bow: int
 
@@ -71,6 +77,7 @@ class Widths:
         return cls(
             {name: (worst,) * len(SENSOR) for name in cameras},
             float(FIELD_LEVELS[-2]),
+            float(SHAPE_LEVELS[-1]),
             worst,
             worst,
         )
@@ -90,7 +97,7 @@ class Option:
     log_prior: float
 
 
-def options(name: str, cameras: int) -> tuple[Option, ...]:
+def width_options(name: str, cameras: int) -> tuple[Option, ...]:
     """All options of a class: one level for all cameras, or the widest level for one camera only.
 
     The first is the narrowest, the ``LEVELS``-th the widest in all cameras.

@@ -19,7 +19,7 @@ from station.calibration.detect.ball_image import (
     INCIDENCE_COSINE,
     ball_image,
     normal_equations,
-    predict,
+    ray_inverse_depth,
 )
 from station.calibration.detect.ball_votes import candidates
 from station.calibration.detect.detections import BallDetection
@@ -231,7 +231,7 @@ def _patches(
     x, y = _bilinear(ray, middle_u, middle_v)
     at_middle = np.array(
         [
-            predict(xi, yi, center[0], center[1], center[2], radius)[0]
+            ray_inverse_depth(xi, yi, center[0], center[1], center[2], radius)[0]
             for xi, yi in zip(x, y, strict=True)
         ]
     )

@@ -48,7 +48,7 @@ def _meet(x, y, cx, cy, cz, radius, least_share):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, nogil=True)
-def predict(x, y, cx, cy, cz, radius):  # type: ignore[no-untyped-def]  # pragma: no cover
+def ray_inverse_depth(x, y, cx, cy, cz, radius):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Inverse depth of a ball along the ray (x, y, 1), cosine of incidence, and the derivative of
     the inverse depth by centre and radius; cosine 0 where the ray misses."""
     w, s, length, gx, gy, gz, gr, _, _ = _meet(x, y, cx, cy, cz, radius, 0.0)
@@ -92,7 +92,7 @@ def normal_equations(inverse, ray, center, radius, gate, fixed):  # type: ignore
     g = np.empty(4)
     for v in range(inverse.shape[0]):
         for u in range(inverse.shape[1]):
-            w, cosine, gx, gy, gz, gr = predict(
+            w, cosine, gx, gy, gz, gr = ray_inverse_depth(
                 ray[v, u, 0], ray[v, u, 1], center[0], center[1], center[2], radius
             )
             if cosine < INCIDENCE_COSINE:
@@ -123,7 +123,7 @@ def ball_image(ray, center, radius):  # type: ignore[no-untyped-def]  # pragma: 
     cosine = np.zeros(ray.shape[:2])
     for v in range(ray.shape[0]):
         for u in range(ray.shape[1]):
-            w, c, _, _, _, _ = predict(
+            w, c, _, _, _, _ = ray_inverse_depth(
                 ray[v, u, 0], ray[v, u, 1], center[0], center[1], center[2], radius
             )
             expected[v, u], cosine[v, u] = w, c

@@ -265,7 +265,7 @@ def board(
         procedure.guide.say(report.words())
         lens = report.lens
         found[name] = None if lens is None else Lens(lens.K.tolist(), lens.distortion.tolist())
-    session.keep_lenses(found)
+    session.record_lenses(found)
 
 
 def _two_numbers(text: str) -> tuple[int, int]:

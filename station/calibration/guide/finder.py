@@ -24,15 +24,15 @@ _RESET_S = 1.0
 class BallFinder:
     """Finds the ball of a session in front of its empty booth. Use it in a ``with`` statement."""
 
-    def __init__(self, session: Session, *, patient: bool) -> None:
-        """``patient``: process every due frame, even if the search falls behind."""
+    def __init__(self, session: Session, *, every_frame: bool) -> None:
+        """``every_frame``: process each frame that is due, even if the search falls behind."""
         self._radius_m, self._cameras = session.radius_m, session.lensed_cameras()
         self._backgrounds = {
             name: view.depth_m()
             for name in session.cameras
             if (view := session.background(name)) is not None
         }
-        self._patient = patient
+        self._every_frame = every_frame
         self._due_s: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(_THREADS)
         self._pending: deque[Future[BallDetection | None]] = deque()
@@ -50,7 +50,7 @@ class BallFinder:
             late_s = frame.time_s - due_s
             if -_RESET_S < late_s < -_EARLY_S:
                 continue
-            if self._patient or len(self._pending) < _WAITING:
+            if self._every_frame or len(self._pending) < _WAITING:
                 # Frames near their due time keep the schedule: of 30 a second 20 are used, not 15.
                 beat_s = due_s if abs(late_s) < _NEAR_S else frame.time_s
                 self._due_s[frame.camera] = beat_s + _APART_S

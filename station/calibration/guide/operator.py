@@ -65,7 +65,7 @@ class Guide:
         """The step is over: the operator may move again."""
         self.say(f"{text}{_BELL if self.attended else ''}")
 
-    def another(self, question: str) -> bool:
+    def answers_yes(self, question: str) -> bool:
         """Ask whether the operator wants one more; no when nobody is there."""
         self.end_line()
         return self.attended and click.confirm(f"  {question}", default=True)

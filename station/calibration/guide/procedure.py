@@ -14,7 +14,7 @@ from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import SESSION, Session
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
-    covered,
+    coverage_so_far,
     look_at_empty_booth,
     look_at_wall,
     rest_ball,
@@ -73,7 +73,7 @@ class Procedure:
             )
         if session is None or not session.done(EMPTY):
             self.empty()
-        if session is None or not covered(session, self.config.reference).enough:
+        if session is None or not coverage_so_far(session, self.config.reference).enough:
             self.ball()
         if session is None or not session.done(MARK):
             self.rest(MARK)
@@ -106,7 +106,7 @@ class Procedure:
             wave_ball(
                 feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
             )
-        if covered(session, self.config.reference).enough:
+        if coverage_so_far(session, self.config.reference).enough:
             from station.calibration.solve.refusals import check_radius
 
             check_radius(session.balls, session.radius_m)
@@ -126,7 +126,7 @@ class Procedure:
                 if not (self.recordings / step).is_dir():
                     return
             elif place >= len(_AROUND) and (
-                asked or (place > before and not self.guide.another("Lay it at another place?"))
+                asked or (place > before and not self.guide.answers_yes("Lay it at another place?"))
             ):
                 return
             where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
@@ -163,7 +163,7 @@ class Procedure:
             if self.recordings is not None:
                 if not (self.recordings / f"{WALL}-{place}").is_dir():
                     return
-            elif (asked or place > before) and not self.guide.another(
+            elif (asked or place > before) and not self.guide.answers_yes(
                 "A flat board at several distances improves the depth accuracy. Record it at one "
                 "more place?"
             ):

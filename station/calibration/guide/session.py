@@ -163,7 +163,7 @@ class Session:
         path = self.folder / SCENE / f"{camera}.npz"
         return StaticView.load(path) if path.exists() else None
 
-    def keep_empty(
+    def record_empty(
         self, views: Mapping[str, StaticView], planes: Sequence[PlaneObservation]
     ) -> None:
         """The empty booth and its floor."""
@@ -180,11 +180,11 @@ class Session:
     def wall_count(self) -> int:
         return sum(name.startswith(WALL) for name in self.planes)
 
-    def keep_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
+    def record_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
         """A flat board at one place ("wall-0", "wall-1", ...)."""
         self._append({"step": place, "planes": [plane.to_json() for plane in planes]})
 
-    def keep_resting(self, step: str, balls: Sequence[BallDetection]) -> None:
+    def record_resting(self, step: str, balls: Sequence[BallDetection]) -> None:
         """The ball on the mark (MARK), in front of it (FRONT) or elsewhere ("around-0", ...)."""
         self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
 
@@ -192,7 +192,7 @@ class Session:
         """Start another run of waving, whose times are unrelated to those before."""
         self._append({"step": "run"})
 
-    def keep_balls(self, balls: Sequence[BallDetection]) -> None:
+    def record_balls(self, balls: Sequence[BallDetection]) -> None:
         """The waved ball, since the last call."""
         if balls:
             self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
@@ -201,7 +201,7 @@ class Session:
         """Wave from the beginning: another radius, a ball that slipped."""
         self._append({"step": "forget-balls"})
 
-    def keep_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
+    def record_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
         """Intrinsics that the board constrains better than the factory's; None: the factory's."""
         document = {
             name: None if lens is None else {"K": lens.K, "distortion": lens.distortion}

@@ -48,7 +48,7 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
         if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
     ]
     views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
-    session.keep_empty(views, floors)
+    session.record_empty(views, floors)
     seen = ", ".join(floor.camera for floor in floors)
     guide.done(
         f"empty booth kept; the floor is seen by {seen}"
@@ -78,7 +78,7 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
         raise CalibrationError(
             "no camera sees a flat board: hold it upright, facing the cameras, 1 m or more wide"
         )
-    session.keep_wall(name, walls)
+    session.record_wall(name, walls)
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
 
@@ -118,7 +118,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     still: dict[str, list[BallDetection]] = {}
     now_s = time.monotonic()
     give_up_s, settled_s = now_s + _RESTING_S, np.inf
-    with BallFinder(session, patient=feed.replays) as finder:
+    with BallFinder(session, every_frame=feed.replays) as finder:
         while now_s < min(give_up_s, settled_s) and not feed.over:
             finder.submit(feed.newest())
             for ball in finder.found():
@@ -138,7 +138,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
             f"{session.radius_m:g} m (calibrate.ball_radius_m)"
         )
     kept = [ball for seen in still.values() for ball in seen[-_RESTING_DETECTIONS:]]
-    session.keep_resting(step, kept)
+    session.record_resting(step, kept)
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
 
 
@@ -150,7 +150,7 @@ def _at_rest(seen: list[BallDetection]) -> bool:
     return bool(np.median(away) < _RESTING_M)
 
 
-def covered(session: Session, reference: str) -> Coverage:
+def coverage_so_far(session: Session, reference: str) -> Coverage:
     """Coverage of the booth by the waved ball so far."""
     coverage = Coverage(session.lensed_cameras(), reference)
     for ball in session.balls:
@@ -165,7 +165,7 @@ def wave_ball(
 
     What was seen is on disk within a second; Ctrl-C ends the step and keeps it.
     """
-    coverage = covered(session, reference)
+    coverage = coverage_so_far(session, reference)
     session.begin_run()
     resets: dict[str, int] = {}
     waiting: list[BallDetection] = []
@@ -176,11 +176,11 @@ def wave_ball(
         waiting.extend(balls)
 
     def write() -> None:
-        session.keep_balls(waiting)
+        session.record_balls(waiting)
         waiting.clear()
 
     began_s = written_s = time.monotonic()
-    with BallFinder(session, patient=feed.replays) as finder:
+    with BallFinder(session, every_frame=feed.replays) as finder:
         try:
             while not feed.over:
                 for frame in feed.newest():

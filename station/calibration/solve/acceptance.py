@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.adjust.equations import corrected_centers
-from station.calibration.adjust.problem import Problem, Sightings, State
+from station.calibration.adjust.problem import Problem, Sightings, State, seen_shape
 from station.calibration.solve.pairwise import Track
 from station.core.geometry import transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -90,7 +90,7 @@ def overall_rms(found: Mapping[str, HeldOut]) -> float:
     )
 
 
-def inflated(predicted: PredictedError, found: Mapping[str, HeldOut]) -> PredictedError:
+def widen_by_test(predicted: PredictedError, found: Mapping[str, HeldOut]) -> PredictedError:
     """Predicted errors widened by what the held-out test shows beyond its own noise.
 
     A camera's mean offset against the others has the variance rms^2 / n of its own; what exceeds
@@ -137,8 +137,9 @@ def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
     """Detections in the reference frame after depth correction and clock offset."""
     name = seen.camera
     centers = corrected_centers(
-        seen, problem.cameras[name], problem.model, state.sensors[name], state.radius_m
-    )
+        seen, problem.cameras[name], problem.model, state.sensors[name], state.radius_m,
+        seen_shape(problem, state, name, seen.times_s),
+    )  # fmt: skip
     return Track(seen.times_s + state.clock_s[name], transform(state.poses[name], centers))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.adjust.equations import bow_terms, corrected_centers
-from station.calibration.adjust.problem import Problem, Sightings, State, Surface
+from station.calibration.adjust.problem import Problem, Sightings, State, Surface, seen_shape
 from station.calibration.adjust.trajectory import TimeGrid, path_points
 from station.calibration.detect.detections import FLOOR, MARK, BallDetection, PlaneObservation
 from station.calibration.solve.pairwise import GATE_M, Track
@@ -85,7 +85,9 @@ def sorted_detections(
     return found
 
 
-def confirmed(detections: Mapping[str, Detections], poses: Mapping[str, Array]) -> dict[str, Mask]:
+def agreeing_detections(
+    detections: Mapping[str, Detections], poses: Mapping[str, Array]
+) -> dict[str, Mask]:
     """Masks of the detections that at least one other camera agrees with."""
     in_reference = {
         name: Track(own.track.times_s, transform(poses[name], own.track.points))
@@ -184,7 +186,7 @@ def floor_below(centers: Array, radius_m: float) -> Array:
     return np.asarray(down / (down @ middle + radius_m))
 
 
-def with_bow(problem: Problem, poses: Mapping[str, Array]) -> Problem:
+def add_bow_terms(problem: Problem, poses: Mapping[str, Array]) -> Problem:
     """The problem with the terms of the floor's bow, about the mark.
 
     Poses good to centimetres are enough: the bow is smooth over decimetres.
@@ -256,8 +258,9 @@ def extended_state(problem: Problem, training: Problem, solved: State) -> State:
     times, places = [known], [points]
     for name, seen in problem.waved.items():
         centers = corrected_centers(
-            seen, problem.cameras[name], problem.model, solved.sensors[name], solved.radius_m
-        )
+            seen, problem.cameras[name], problem.model, solved.sensors[name], solved.radius_m,
+            seen_shape(problem, solved, name, seen.times_s),
+        )  # fmt: skip
         found, when = transform(solved.poses[name], centers), seen.times_s + solved.clock_s[name]
         first, value, _ = grid.basis(when)
         near = np.linalg.norm(found - path_points(bridged, first, value), axis=1) < _BRIDGED_M

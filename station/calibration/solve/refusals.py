@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.problem import State
+from station.calibration.adjust.normal import contact_error_m
+from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, Observations
@@ -31,6 +32,8 @@ CONVERGED, DIVERGED = 0.3, 10.0
 """Largest last steps, in standard deviations, of a final solution and of one whose further checks
 can still name the faulty camera."""
 _MARK_TOLERANCE_M = 0.008
+_STAND_TOLERANCE_M = 0.004
+"""Four standard deviations of a height that was measured with a tape."""
 _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
 SIGMAS_95 = 1.96
@@ -49,14 +52,14 @@ class Limits:
     girth_m: float = 0.008
 
 
-def check_counts(covered: Coverage) -> None:
-    if not any(covered.counts().values()):
+def check_counts(coverage: Coverage) -> None:
+    if not any(coverage.counts().values()):
         raise CalibrationError("the ball has not been waved yet: station calibrate ball")
-    for name, count in covered.counts().items():
+    for name, count in coverage.counts().items():
         if count < _MIN_DETECTIONS:
             raise CalibrationError(
                 f"camera {name} saw the ball in {count} frames only ({_MIN_DETECTIONS} are "
-                f"needed): check that the camera works and is not covered, and wave the ball "
+                f"needed): check that the camera works and is not coverage, and wave the ball "
                 f"where {name} looks"
             )
 
@@ -172,7 +175,7 @@ def remedy(stood: bool) -> str:
 
 
 def check_predicted(
-    predicted: PredictedError, limits: Limits, covered: Coverage, stood: bool
+    predicted: PredictedError, limits: Limits, coverage: Coverage, stood: bool
 ) -> None:
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
     for what, sigma_m, limit_m in (
@@ -180,7 +183,7 @@ def check_predicted(
         ("girths", predicted.girth_sigma_m, limits.girth_m),
     ):
         if not SIGMAS_95 * sigma_m <= limit_m:
-            more = "" if covered.enough else f"; {covered.advice()}"
+            more = "" if coverage.enough else f"; {coverage.advice()}"
             raise CalibrationError(
                 f"with this calibration, {what} could be wrong by up to "
                 f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, but the limit is "
@@ -195,6 +198,18 @@ def check_slope(world_poses: WorldPoses) -> None:
             "the floor's slope is only known to within "
             f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {AROUND_WORDS}"
         )
+
+
+def check_stands(problem: Problem, state: State) -> None:
+    for place, height_m in problem.heights_m.items():
+        off_m = contact_error_m(problem, state, place)
+        if abs(off_m) > _STAND_TOLERANCE_M:
+            raise CalibrationError(
+                f"the ball on the stand of {height_m:.3f} m was seen {1e3 * abs(off_m):.0f} mm too "
+                f"{'high' if off_m > 0.0 else 'low'}: measure the height of its underside above "
+                "the floor again, and repeat that step; if it was right, let the sensors warm up "
+                "and wave the ball again"
+            )
 
 
 def check_upright(world_poses: WorldPoses) -> None:

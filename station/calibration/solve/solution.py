@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from station.calibration.adjust.averaging import averaged_state, most_probable_widths
+from station.calibration.adjust.ball_shape import SHAPE
 from station.calibration.adjust.joint import solve_joint
-from station.calibration.adjust.problem import Problem, Sightings, State
+from station.calibration.adjust.problem import ROUND, SHAPE_KNOT_S, Problem, Sightings, State
 from station.calibration.adjust.sensor_model import COARSE, SensorModel
+from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import FLOOR, FRONT, MARK, STAND, Observations
@@ -24,7 +26,8 @@ from station.calibration.solve import acceptance, clocks, refusals, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
     Detections,
-    confirmed,
+    add_bow_terms,
+    agreeing_detections,
     extended_state,
     first_state,
     named_surfaces,
@@ -32,14 +35,13 @@ from station.calibration.solve.initial import (
     resting_sightings,
     sorted_detections,
     spread_m,
-    with_bow,
 )
 from station.calibration.solve.pairwise import chain_poses, estimate_pairs
 from station.calibration.solve.predicted import predict_errors
 from station.calibration.solve.refusals import Limits
 from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
-from station.core.rig import CameraCalibration, Rig
+from station.core.rig import CameraCalibration, PredictedError, Rig
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -138,77 +140,81 @@ def solve(
     """
     # One BLAS thread: other processes use the second core, and more threads wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _solve(
-            observations, cameras, radius_m, reference, front_cameras, created, progress, limits
-        )
+        progress("checking the detections")
+        coverage = Coverage(cameras, reference)
+        for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
+            coverage.add(ball)
+        refusals.check_counts(coverage)
+        measured_m = refusals.check_radius(observations.balls, radius_m)
+        detections = sorted_detections(observations.balls, list(cameras), radius_m)
+        refusals.check_rest(observations, front_cameras)
+
+        progress("finding the relative positions of the cameras")
+        pairs = estimate_pairs({name: own.track for name, own in detections.items()})
+        refusals.check_pairs(detections, pairs)
+        poses = chain_poses(pairs, reference, list(cameras))
+        refusals.check_connected(cameras, poses)
+
+        problem = _problem(observations, cameras, detections, poses, radius_m, reference)
+        progress("solving, with every fifth second kept for the test")
+        training, tested, found = _tested(problem, poses)
+
+        progress("solving with all detections")
+        problem, state = _final(problem, training, tested)
+        world_poses = world.poses_in_world(problem, state, front_cameras)
+        refusals.check_upright(world_poses)
+        refusals.check_slope(world_poses)
+        refusals.check_stands(problem, state)
+        refusals.check_mark(world_poses, radius_m)
+        rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
+        predicted = predict_errors(problem, state, world_poses, rig.cameras)
+        predicted = acceptance.widen_by_test(predicted, found)
+        stood = bool(problem.heights_m)
+        refusals.check_predicted(predicted, limits, coverage, stood)
+        rig = replace(rig, predicted=predicted)
+        weak = _advice(predicted, world_poses, limits, coverage, stood)
+        return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
 
 
-def _solve(
-    observations: Observations,
-    cameras: Mapping[str, CameraCalibration],
-    radius_m: float,
-    reference: str,
-    front_cameras: Sequence[str],
-    created: str,
-    progress: Progress,
-    limits: Limits,
-) -> Solution:
-    progress("checking the detections")
-    covered = Coverage(cameras, reference)
-    for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
-        covered.add(ball)
-    refusals.check_counts(covered)
-    measured_m = refusals.check_radius(observations.balls, radius_m)
-    detections = sorted_detections(observations.balls, list(cameras), radius_m)
-    refusals.check_rest(observations, front_cameras)
+def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem, State]:
+    """The problem under the most probable widths, and its solution averaged over all of them.
 
-    progress("finding the relative positions of the cameras")
-    pairs = estimate_pairs({name: own.track for name, own in detections.items()})
-    refusals.check_pairs(detections, pairs)
-    poses = chain_poses(pairs, reference, list(cameras))
-    refusals.check_connected(cameras, poses)
-
-    problem = _problem(observations, cameras, detections, poses, radius_m, reference)
-    progress("solving, with every fifth second kept for the test")
-    training, tested, found = _tested(problem, poses)
-
-    progress("solving with all detections")
+    ``tested`` solves ``training``, which lacks the held-out seconds.
+    """
     try:
         problem = replace(problem, widths=most_probable_widths(training, tested))
         start = extended_state(problem, training, tested)
         state = solve_joint(problem, start, _FINE_ITERATIONS)
         refusals.check_converged(state)
-        state = averaged_state(problem, state)
+        return problem, averaged_state(problem, state)
     except np.linalg.LinAlgError:
         # Equations without a solution come from detections that contradict one another.
         refusals.check_converged(replace(tested, last_step=np.inf))
         raise
-    world_poses = world.poses_in_world(problem, state, front_cameras)
-    refusals.check_upright(world_poses)
-    refusals.check_slope(world_poses)
-    refusals.check_mark(world_poses, radius_m)
-    rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
-    predicted = acceptance.inflated(predict_errors(problem, state, world_poses, rig.cameras), found)
-    stood = bool(problem.heights_m)
-    refusals.check_predicted(predicted, limits, covered, stood)
-    rig = replace(rig, predicted=predicted)
-    weak = [] if covered.enough else [covered.advice()]
+
+
+def _advice(
+    predicted: PredictedError, world_poses: WorldPoses, limits: Limits, coverage: Coverage,
+    stood: bool,
+) -> tuple[str, ...]:  # fmt: skip
+    """What could be better; ``stood``: the ball was on a stand."""
+    weak = [] if coverage.enough else [coverage.advice()]
     if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
         weak.append(f"for heights, {refusals.remedy(stood)}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
         weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
-    return Solution(rig, world_poses, found, tuple(weak), state.clock_s, measured_m)
+    return tuple(weak)
 
 
 def _tested(
     problem: Problem, poses: Mapping[str, Array]
 ) -> tuple[Problem, State, dict[str, HeldOut]]:
     """The problem without the held-out seconds, its solution, and the test on these seconds."""
-    training = acceptance.without_held_out(replace(problem, model=COARSE))
+    training = acceptance.without_held_out(replace(problem, model=COARSE, shape_grid=ROUND))
     coarse = solve_joint(training, first_state(training, poses), informed=False)
     refusals.check_converged(coarse, refusals.DIVERGED)
-    training = replace(training, model=problem.model)
-    tested = solve_joint(training, _refined(coarse, COARSE, problem.model), _FINE_ITERATIONS)
+    training = replace(training, model=problem.model, shape_grid=problem.shape_grid)
+    tested = solve_joint(training, _refined(coarse, COARSE, problem), _FINE_ITERATIONS)
     refusals.check_converged(tested, refusals.DIVERGED)
     found = acceptance.compare_held_out(problem, tested)
     refusals.check_clocks(
@@ -232,7 +238,7 @@ def _problem(
     radius_m: float,
     reference: str,
 ) -> Problem:
-    agreed = confirmed(detections, poses)
+    agreed = agreeing_detections(detections, poses)
     waved = {
         name: Sightings.of(
             camera,
@@ -267,15 +273,23 @@ def _problem(
                 f"places that form a triangle: {refusals.AROUND_WORDS}"
             )
     problem = Problem(
-        cameras, reference, radius_m, waved, resting, surfaces, Widths.widest(cameras), heights_m
+        cameras, reference, radius_m, waved, resting, surfaces, Widths.widest(cameras), heights_m,
+        shape_grid=TimeGrid.over(
+            np.concatenate([seen.times_s for seen in waved.values()]), knot_s=SHAPE_KNOT_S
+        ),
+    )  # fmt: skip
+    return add_bow_terms(problem, poses)
+
+
+def _refined(state: State, coarse: SensorModel, problem: Problem) -> State:
+    """The state with the parameters that the problem's finer model adds at zero."""
+    sensors = {name: coarse.expanded(own, problem.model) for name, own in state.sensors.items()}
+    return replace(
+        state,
+        sensors=sensors,
+        shape=np.zeros((problem.shape_grid.count, SHAPE)),
+        place_shapes={place: np.zeros(SHAPE) for place in problem.resting},
     )
-    return with_bow(problem, poses)
-
-
-def _refined(state: State, coarse: SensorModel, fine: SensorModel) -> State:
-    """The state with the parameters that a finer model adds at zero."""
-    sensors = {name: coarse.expanded(own, fine) for name, own in state.sensors.items()}
-    return replace(state, sensors=sensors)
 
 
 def _rig(

@@ -61,7 +61,7 @@ class PageGuide(Guide):
     def done(self, text: str) -> None:
         self._say("done", text=text)
 
-    def another(self, question: str) -> bool:
+    def answers_yes(self, question: str) -> bool:
         if not self.attended:
             return False
         self._say("question", text=question)

@@ -159,13 +159,13 @@ def _session(store: CalibrationStore) -> Session:
 
 def _see(session: Session) -> None:
     if not session.done(EMPTY):
-        session.keep_empty({}, [])
+        session.record_empty({}, [])
     while session.runs < _RUNS:
         session.begin_run()
-        session.keep_balls([_ball(float(index)) for index in range(5)])
+        session.record_balls([_ball(float(index)) for index in range(5)])
     for step in (MARK, FRONT):
         if not session.done(step):
-            session.keep_resting(step, [_ball(0.0)])
+            session.record_resting(step, [_ball(0.0)])
 
 
 def _ball(time_s: float) -> BallDetection:
