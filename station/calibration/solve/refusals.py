@@ -59,7 +59,7 @@ def check_counts(coverage: Coverage) -> None:
         if count < _MIN_DETECTIONS:
             raise CalibrationError(
                 f"camera {name} saw the ball in {count} frames only ({_MIN_DETECTIONS} are "
-                f"needed): check that the camera works and is not coverage, and wave the ball "
+                f"needed): check that the camera works and is not covered, and wave the ball "
                 f"where {name} looks"
             )
 
