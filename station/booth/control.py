@@ -170,8 +170,8 @@ class ControlProcess:
     def _scan(self, request: Request) -> Reply:
         """Record an order and pass it on; only sync decides its outcome."""
         scan_id = scan_id_of(request.scan_id)
-        if self._session(scan_id) is not None:
-            return Reply(ok=True, content=self._scan_status(scan_id))
+        if (known := self._known(scan_id)) is not None:
+            return Reply(ok=True, content=known)
         if not self._streaming:
             return Reply(ok=False, error="the sensors are stopped; run station start first")
         now_s = time.monotonic()
@@ -224,10 +224,22 @@ class ControlProcess:
         Raises:
             BoothError: there is no such scan.
         """
-        session = self._session(scan_id)
-        if session is None:
+        status = self._known(scan_id)
+        if status is None:
             raise BoothError(f"there is no scan {scan_id}; see station list")
-        return asdict(session)
+        return status
+
+    def _known(self, scan_id: ScanId) -> dict[str, Any] | None:
+        """A scan's state, or None if there is no such scan.
+
+        A disk that cannot be read says neither: a refusal would be untrue, as the scan may go on.
+        """
+        try:
+            session = self._session(scan_id)
+        except OSError as error:
+            self._log.warning("the state of a scan cannot be read: %s", error)
+            session = Session(scan_id, "", "armed", reason=UNSURE)
+        return None if session is None else asdict(session)
 
     def _session(self, scan_id: ScanId) -> Session | None:
         note = self._spool.notes.read(scan_id)

@@ -195,7 +195,7 @@ def scan(
     session = _ask_until_answered(config, order)
     click.echo(f"scan {scan_id}")
     try:
-        session = _follow(config, scan_id, session, _enough(wait), began_s + timeout_s)
+        session = _follow(config, order, session, _enough(wait), began_s + timeout_s)
     except KeyboardInterrupt:
         raise BoothError(
             f"scan {scan_id} continues without this command; see its state with: station find "
@@ -221,12 +221,13 @@ def _enough(wait: bool) -> Callable[[str], bool]:
 
 def _follow(
     config: BoothConfig,
-    scan_id: str,
+    order: Request,
     session: dict[str, Any],
     enough: Callable[[str], bool],
     deadline_s: float,
 ) -> dict[str, Any]:
     """Show each new state on a line of its own until it is enough."""
+    scan_id = order.scan_id
     told, free, sure_s = "", False, time.monotonic()
     while True:
         state = session["state"]
@@ -256,7 +257,10 @@ def _follow(
                 f"scan {scan_id} was not done in time (its state is {state}); see station status"
             )
         time.sleep(_POLL_S)
-        session = _ask_until_answered(config, Request("scan-status", scan_id))
+        # The order itself may not have been recorded; repeated, it is the same scan.
+        unsure = session["reason"] == UNSURE
+        request = order if unsure else Request("scan-status", scan_id)
+        session = _ask_until_answered(config, request)
 
 
 class UnsureError(BoothError):

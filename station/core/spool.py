@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from station.core.errors import SpoolError
-from station.core.files import fsync_folder, private_folder, publish_folder, write_json
+from station.core.files import entries_of, fsync_folder, private_folder, publish_folder, write_json
 from station.core.scans import REASON, ScanFolders, ScanId, ScanNote, Stage, boot_id, is_scan_id
 
 MAX_DEATHS = 10
@@ -79,7 +79,10 @@ class Spool(ScanFolders):
         claim = self._claim(ScanId(scan_id))
         if claim is None:
             return False
-        claim.fail(reason)
+        try:
+            claim.fail(reason)
+        finally:
+            claim.close()
         return True
 
     def retry(self, scan_id: ScanId) -> None:
@@ -125,7 +128,16 @@ class Spool(ScanFolders):
                     claim.close()
             except OSError as error:
                 _LOG.warning("scan %s waits for the disk: %s", scan_id, error)
+        self._remove_idle_locks()
         return back
+
+    def _remove_idle_locks(self) -> None:
+        """Remove lock files that a refusing disk left behind: they bear the names of scans."""
+        for path in entries_of(self.folder / "locks"):
+            if not is_scan_id(path.stem) or self.path("work", path.stem).exists():
+                continue
+            if (lock := self.lock(ScanId(path.stem))) is not None:
+                self.unlock(ScanId(path.stem), lock)
 
     def _settle(self, claim: Claim, retries: int) -> bool:
         """End an abandoned claim; True if the scan was put back."""
@@ -139,6 +151,8 @@ class Spool(ScanFolders):
             else:
                 # It got its name before the crash, and was taken from the outbox since.
                 claim.delivered()
+        elif note.stage == "failed":
+            claim.fail(note.reason)
         elif note.tries > retries:
             claim.fail(f"{note.tries} reconstructions failed; the last one: {note.reason}")
         elif note.deaths >= MAX_DEATHS:

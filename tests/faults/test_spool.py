@@ -1,3 +1,4 @@
+import errno
 import multiprocessing
 import os
 import signal
@@ -216,3 +217,39 @@ def test_a_living_workers_claim_is_left_alone(tmp_path: Path) -> None:
 def test_a_full_disk_is_said_before_the_scan(tmp_path: Path) -> None:
     with pytest.raises(SpoolError, match="MB free"):
         Spool(tmp_path).check_space(1e12)
+
+
+def test_a_disk_that_refuses_while_a_scan_is_cancelled_leaves_nothing_stuck(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    with monkeypatch.context() as disk:
+        disk.setattr("station.core.spool.Claim._move", _refuse)
+        with pytest.raises(OSError, match="Input/output"):
+            spool.withdraw("a", "cancelled by the operator")
+    # The note says that it failed: another process brings that to its end.
+    assert Spool(tmp_path).recover(2) == []
+    assert spool.where("a") == "failed"
+    assert failure_reason(spool.path("failed", "a")) == "cancelled by the operator"
+
+
+def test_a_lock_file_that_could_not_be_removed_is_removed_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = Spool(tmp_path)
+    lock = spool.lock(ScanId("a"))
+    assert lock is not None
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "unlink", _refuse)
+        spool.unlock(ScanId("a"), lock)
+    held = spool.lock(ScanId("b"))
+    assert held is not None
+    assert len(list((tmp_path / "locks").iterdir())) == 2
+    Spool(tmp_path).recover(2)
+    assert [path.stem for path in (tmp_path / "locks").iterdir()] == ["b"]
+    spool.unlock(ScanId("b"), held)
+
+
+def _refuse(*_: object, **__: object) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))

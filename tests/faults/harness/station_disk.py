@@ -22,7 +22,7 @@ from injection import ERRNOS, Injection
 from table import Row
 
 _RETURN_S = 10.0
-_ERRNOS_A_LIFE = 4
+_ERRNOS_A_LIFE, _SCANS_A_LIFE = 6, 20
 _SETTLED_S = 4.0
 """A fault at one call is over by then: the pauses of sync, workers and recovery are shorter."""
 _OUTAGE_S = 3.0
@@ -106,7 +106,7 @@ def _one_life(
     def met() -> bool:
         return all(booth.disk[role].hits >= count for role, count in wanted.items())
 
-    for _ in range(_ERRNOS_A_LIFE + 1):
+    for _ in range(_SCANS_A_LIFE):
         scans.take()
         until(lambda: met() or _idle(booth), _SETTLED_S)
         if met():
@@ -165,7 +165,8 @@ def _nothing_stuck(booth: Booth) -> Row:
         for state in ("work", "locks", "queue")
         for path in (booth.spool / state).iterdir()
     ]
-    return Row("claims after errnos", "0 stuck", f"{len(stuck)} stuck", not stuck)
+    words = f"{len(stuck)} stuck {' '.join(stuck)}"
+    return Row("claims after errnos", "0 stuck", words, not stuck)
 
 
 def stall_rows(points: int, seed: int) -> list[Row]:

@@ -1,0 +1,67 @@
+"""Control on a disk that fails: nothing is told of a scan that may turn out untrue."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from station.booth.control import ControlProcess
+from station.booth.session import UNSURE
+from station.core.config import load_config
+from station.core.errors import BoothError
+from station.core.scans import Notes
+from station.messaging.messages import Request
+
+_CONFIG = """
+[[cameras]]
+name = "front-lower"
+driver = "recorded"
+recording = "front-lower"
+[spool]
+folder = "spool"
+"""
+_ORDER = Request("scan", "a", "", 1e9)
+
+
+@pytest.fixture
+def control(tmp_path: Path) -> Iterator[ControlProcess]:
+    (tmp_path / "booth.toml").write_text(_CONFIG)
+    process = ControlProcess(load_config(tmp_path / "booth.toml"), logging.getLogger())
+    process._reply(Request("start"))
+    yield process
+    process._context.destroy(linger=0)
+
+
+@pytest.mark.parametrize("failing_read", [1, 2, 3])
+def test_a_disk_that_cannot_be_read_is_no_refusal(
+    control: ControlProcess, monkeypatch: pytest.MonkeyPatch, failing_read: int
+) -> None:
+    reads = 0
+    whole = Notes.read
+
+    def read(notes: Notes, scan_id: object) -> object:
+        nonlocal reads
+        reads += 1
+        if reads == failing_read:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return whole(notes, scan_id)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Notes, "read", read)
+    first = control._reply(_ORDER)
+    assert first.ok
+    # An order that was not recorded is recorded now; another one is the same scan.
+    again = control._reply(_ORDER)
+    assert again.ok
+    last = control._reply(_ORDER)
+    assert (last.ok, last.content["state"], last.content["reason"]) == (True, "armed", "")
+    assert UNSURE in (first.content["reason"], again.content["reason"])
+
+
+def test_a_scan_that_nobody_ordered_is_none(control: ControlProcess) -> None:
+    with pytest.raises(BoothError, match="there is no scan b"):
+        control._reply(Request("scan-status", "b"))
