@@ -11,9 +11,11 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -56,7 +58,20 @@ def observe(booth: SimulatedBooth, images: bool) -> Observations:
     return Observations.merged([simulate(procedure, camera) for camera in cameras.values()])
 
 
-def judge(name: str, seed: int, images: bool) -> str:
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What one booth says about the honesty of its stated errors."""
+
+    words: str
+    ratios: tuple[float, float, float] | None = None
+    """Errors of height, girth (at the middle of the trunk) and tilt over what is stated; None if
+    refused."""
+    chi2: float = 0.0
+    beyond_twice: bool = False
+    """Accepted, with an error of more than twice a bar."""
+
+
+def judge(name: str, seed: int, images: bool) -> Verdict:
     """One booth's row of the table."""
     booth = synthetic.booth(seed, switches=CASES[name])
     seen = observe(booth, images)
@@ -64,7 +79,7 @@ def judge(name: str, seed: int, images: bool) -> str:
     try:
         solution = solved(booth.rig, seen)
     except CalibrationError as refusal:
-        return f"{name:<20}{seed:>4}  refused: {refusal}"
+        return Verdict(f"{name:<20}{seed:>4}  refused: {refusal}")
     seconds = time.process_time() - start_s
     shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.world_poses)[:, 3:], axis=1)
     unknowns = 6 * (len(booth.rig.cameras) - 1)
@@ -84,7 +99,15 @@ def judge(name: str, seed: int, images: bool) -> str:
         "seconds": seconds <= 20.0,
     }
     missed = ", ".join(bar for bar, met in bars.items() if not met)
-    return (
+    beyond_twice = (
+        found.normal_rms_mm > 1.2
+        or found.tilt_deg > 0.3
+        or abs(found.height_mm) > 4.0
+        or girths.mean() > 4.0
+        or girths.max() > 10.0
+    )
+    middle_mm = float(found.girths_mm[len(girths) // 2])
+    words = (
         f"{name:<20}{seed:>4}{np.mean(shifts):7.2f}{np.max(shifts):6.1f}{chi2:7.2f}"
         f"{found.normal_rms_mm:7.2f} ({1e3 * predicted.normal_rms_m:.2f})"
         f"{found.tilt_deg:7.3f} ({tilt_sigma_deg:.3f})"
@@ -93,6 +116,37 @@ def judge(name: str, seed: int, images: bool) -> str:
         f"{1e3 * solution.rig.residual_rms_m:6.2f}{seconds:6.1f}"
         f"  {'missed: ' + missed if missed else 'met'}"
     )
+    ratios = (
+        found.height_mm / (1e3 * predicted.height_sigma_m),
+        middle_mm / (1e3 * predicted.girth_sigma_m),
+        found.tilt_deg / tilt_sigma_deg,
+    )
+    return Verdict(words, ratios, float(chi2), beyond_twice)
+
+
+def summary(verdicts: Sequence[Verdict]) -> None:
+    """The bars that need many booths."""
+    accepted = [one for one in verdicts if one.ratios is not None]
+    if not accepted:
+        return
+    ratios = np.abs(np.array([one.ratios for one in accepted]))
+    beyond = sum(one.beyond_twice for one in accepted)
+    hold = 100.0 * np.mean(ratios[:, :2] < 1.96, axis=0)
+    chi2 = np.array([one.chi2 for one in accepted])
+    print(f"\n{len(accepted)} of {len(verdicts)} booths accepted")
+    print(f"  beyond twice a bar {beyond}  <= 0  {'met' if beyond == 0 else 'MISSED'}")
+    for what, share in zip(("heights", "girths"), hold, strict=True):
+        verdict = "met" if share >= 93.0 else "MISSED"
+        print(f"  {what} within their stated 95 %: {share:.0f} %  >= 93  {verdict}")
+    print(
+        f"  errors over stated sigmas, rms and worst: height {_rms(ratios[:, 0])}, "
+        f"girth {_rms(ratios[:, 1])}, tilt {_rms(ratios[:, 2])}; "
+        f"chi2 a number {chi2.mean():.2f} ({chi2.min():.2f} to {chi2.max():.2f})"
+    )
+
+
+def _rms(ratios: NDArray[np.float64]) -> str:
+    return f"{np.sqrt(np.mean(ratios**2)):.2f} ({ratios.max():.1f})"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -108,9 +162,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{'cloud rms (sigma)':>14}{'tilt deg':>15}{'height mm':>14}{'girths mean/worst':>18}"
         f"{'held':>6}{'s':>6}"
     )
+    verdicts = []
     for name in cases:
         for seed in range(given.first, given.first + given.seeds):
-            print(judge(name, seed, given.images), flush=True)
+            verdicts.append(judge(name, seed, given.images))
+            print(verdicts[-1].words, flush=True)
+    summary(verdicts)
 
 
 if __name__ == "__main__":

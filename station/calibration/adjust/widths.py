@@ -76,7 +76,7 @@ class Widths:
         worst = LEVELS - 1
         return cls(
             {name: (worst,) * len(SENSOR) for name in cameras},
-            float(FIELD_LEVELS[-2]),
+            float(FIELD_LEVELS[-1]),
             float(SHAPE_LEVELS[-1]),
             worst,
             worst,
