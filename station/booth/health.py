@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from station.booth.supervisor import services
+from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
 from station.core.scans import STATES, count_scans
 from station.core.service import read_health
@@ -52,6 +53,7 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     problems += [
         str(problem) for content in processes.values() for problem in content.get("problems", [])
     ]
+    problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
 

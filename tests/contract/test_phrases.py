@@ -24,6 +24,7 @@ SPEAKERS = (
     "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",
     "station/booth/retention.py", "station/core/spool.py", "station/messaging/transport.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
+    "station/calibration/drift/people.py",
     "station/calibration/guide/procedure.py", "station/calibration/guide/steps.py",
     "station/calibration/guide/feed.py", "station/calibration/guide/session.py",
     "station/calibration/guide/store.py", "station/calibration/solve/refusals.py",

@@ -15,6 +15,7 @@ import numpy as np
 
 from station.core.bundle import read_bundle
 from station.core.config import Volume
+from station.core.files import write_json
 from station.core.rig import PredictedError
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
@@ -26,6 +27,7 @@ from workers.export.result import write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
 from workers.measure.intervals import ScanErrors
+from workers.reconstruct.job_handle import EVIDENCE
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
     Method,
@@ -150,6 +152,9 @@ def _fitted(
         watch.seconds.update(fit.seconds)
         progress("writing", 0.0)
         write_result(out_folder, model, fit, fit.cloud, measured, standing, origin, method, watch)
+        if overlapping.evidence is not None and fit.verdict.status == "ok" and origin.calibration:
+            document = overlapping.evidence.document(scan.views, origin.calibration)
+            write_json(out_folder / EVIDENCE, document, durable=False)
     progress("done", 1.0)
     return JobSummary(fit.verdict.status, fit.verdict.reasons)
 

@@ -19,6 +19,8 @@ from typing import Literal
 
 from station.core.config import BoothConfig
 
+EVIDENCE = "cameras.json"
+"""File of a result with what the scan says of its cameras' places; the pool takes it out."""
 _LOOK_S = 0.2
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 import numpy as np
 
-from station.calibration.drift.motion import CameraMove, DriftReference, estimate_move
+from station.calibration.drift.alignment import estimate_move
+from station.calibration.drift.kept import use_correction
+from station.calibration.drift.motion import CameraMove, move_words
+from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
@@ -33,17 +37,36 @@ _SAME_SHARE = 0.97
     help="replay DIR/<camera> instead of the live cameras",
 )
 @click.option("--json", "as_json", is_flag=True, help="for programs")
-def check(config_path: Path | None, recordings: Path | None, as_json: bool) -> None:
+@click.option(
+    "--correct", is_flag=True, help="correct the calibration by the scans of the last people"
+)
+def check(config_path: Path | None, recordings: Path | None, as_json: bool, correct: bool) -> None:
     """Compare the empty booth with what was stored when it was calibrated.
 
     Exit code 0: every camera stands where it did; 3: one has moved, calibrate again.
+
+    With --correct: where the scans of the last people say that a camera has drifted, store and use
+    a corrected calibration, provided that it also fits people whom it was not computed from.
 
     \b
     Examples:
       station check
       station check --json
+      station check --correct
     """
     config = load_config(find_config(config_path))
+    if correct:
+        created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        drift, entry = use_correction(config, created)
+        click.echo(
+            f"camera {drift.camera} is now taken to stand where the scans of the last people saw "
+            f"it: {move_words(drift.xi)} from where it was calibrated"
+        )
+        click.echo(
+            f"calibration {entry.name} is in use; station calibrate --list shows the others, and "
+            "station calibrate --use DATE returns to one of them"
+        )
+        return
     rig = Rig.load(config.calibration)
     scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
     missing = [camera.name for camera in config.cameras if camera.name not in scene]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,3 +114,39 @@ class CameraCorrections:
     def updated(self, change: Array) -> CameraCorrections:
         """Corrections after adding a change (C, 6)."""
         return replace(self, xi=self.xi + change)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEvidence:
+    """What one scan says of its cameras' places, whatever the body: the log-likelihood of the
+    corrections xi is vector . xi - xi . information xi / 2, maximised over the body.
+
+    It accumulates over people, with whom misfits of the body differ and a moved camera does not.
+    """
+
+    information: Array
+    """(6 C, 6 C)."""
+    vector: Array
+    """(6 C,)."""
+
+    def document(self, views: Sequence[CameraView], calibration: str) -> dict[str, Any]:
+        """JSON of format "booth-camera-evidence", in each camera's own frame.
+
+        Args:
+            views: the scan's views, in the order of the corrections.
+            calibration: date of the calibration that the corrections refer to.
+        """
+        turns = [view.calibration.world_from_camera[:3, :3] for view in views]
+        camera_from_world = np.zeros_like(self.information)
+        for index, turn in enumerate(np.repeat(turns, 2, axis=0)):
+            own = slice(3 * index, 3 * index + 3)
+            camera_from_world[own, own] = turn.T
+        turned = camera_from_world @ self.information @ camera_from_world.T
+        return {
+            "format": "booth-camera-evidence",
+            "version": 1,
+            "calibration": calibration,
+            "cameras": [view.name for view in views],
+            "information": np.round(turned, 3).tolist(),
+            "vector": np.round(camera_from_world @ self.vector, 3).tolist(),
+        }

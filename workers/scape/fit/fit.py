@@ -22,7 +22,7 @@ from workers.cloud.observed import (
     PointCloud,
     Preprocessed,
 )
-from workers.scape.evidence.cameras import CameraCorrections
+from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
 from workers.scape.evidence.crown import crown_rows, crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
@@ -116,6 +116,8 @@ class OverlappingFit:
     correspondences: int
     iterations: int
     camera_shifts_m: dict[str, float]
+    evidence: CameraEvidence | None
+    """What the scan says of its cameras' places."""
     seconds: dict[str, float]
 
 
@@ -175,7 +177,7 @@ def fit_overlapping(
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
-    reference = None
+    reference, evidence = None, None
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
             model, target, starts[0], lambda share: progress("icp", share), observer
@@ -186,7 +188,7 @@ def fit_overlapping(
     else:
         joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
-        cameras, reference = joint.cameras, joint.vertices
+        cameras, reference, evidence = joint.cameras, joint.vertices, joint.evidence
         observer("joint", {"vertices": reference})
         fitted = time.monotonic()
         progress("surface", 0.0)
@@ -207,6 +209,7 @@ def fit_overlapping(
         correspondences=used,
         iterations=iterations,
         camera_shifts_m=cameras.shifts_m(scan.cloud),
+        evidence=evidence,
         seconds={
             "align": aligned - start,
             "icp": fitted - aligned,

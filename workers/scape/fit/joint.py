@@ -16,8 +16,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
-from workers.scape.evidence.cameras import CameraCorrections
+from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
 from workers.scape.evidence.correspondence import TrackedPoints
+from workers.scape.evidence.rows import CameraTerms
 from workers.scape.fit.annealing import AnnealingStep
 from workers.scape.fit.gauss_newton import (
     DAMPING,
@@ -60,6 +61,8 @@ class JointResult:
     correspondences: int
     """Number of pairs in the last step."""
     iterations: int
+    evidence: CameraEvidence | None
+    """None where corrections were not estimated."""
 
 
 def fit_jointly(
@@ -88,6 +91,7 @@ def fit_jointly(
         np.concatenate([target.tree.normals[subset], target.rims.normals]),
     )
     terms: DataTerms | None = None
+    evidence: CameraEvidence | None = None
     # Terms that do not depend on each other are computed in two threads.
     with ThreadPoolExecutor(max_workers=2) as beside:
         for step, annealing in enumerate(schedule):
@@ -100,11 +104,19 @@ def fit_jointly(
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
-            state, cameras = _step(model, state, cameras, derivative.result()[1], terms, prior)
+            state, cameras, evidence = _step(
+                model, state, cameras, derivative.result()[1], terms, prior
+            )
             progress((step + 1) / len(schedule))
     assert terms is not None
     return JointResult(
-        state, cameras, model.vertices(state), target.rims, len(terms.on_body), len(schedule)
+        state,
+        cameras,
+        model.vertices(state),
+        target.rims,
+        len(terms.on_body),
+        len(schedule),
+        evidence,
     )
 
 
@@ -115,8 +127,9 @@ def _step(
     derivative: Array32,
     terms: DataTerms,
     prior: TwistPrior,
-) -> tuple[BodyState, CameraCorrections]:
-    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples."""
+) -> tuple[BodyState, CameraCorrections, CameraEvidence | None]:
+    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and what its rows say
+    of the cameras."""
     size = derivative.shape[2]
     shape = shape_parameters(model, size - 3 * model.part_count - 3)
     rows = derivative.reshape(-1, size)
@@ -140,6 +153,22 @@ def _step(
         normal[:size, size:] = -together
         normal[size:, :size] = -together.T
     delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
-    if extra:
+    evidence = None
+    if terms.cameras is not None:
+        evidence = _evidence(normal, gradient, terms.cameras, cameras)
         cameras = cameras.updated(delta[size:].reshape(-1, 6))
-    return updated(state, delta, shape), cameras
+    return updated(state, delta, shape), cameras, evidence
+
+
+def _evidence(
+    normal: Array, gradient: Array, terms: CameraTerms, cameras: CameraCorrections
+) -> CameraEvidence:
+    """The rows' normal equations with the body's parameters eliminated, without the corrections'
+    own prior, about corrections of zero."""
+    size = len(gradient) - len(terms.gradient)
+    cross = normal[:size, size:]
+    body = scipy.linalg.cho_factor(normal[:size, :size])
+    solved = scipy.linalg.cho_solve(body, np.column_stack([cross, gradient[:size]]))
+    information = terms.normal - cross.T @ solved[:, :-1]
+    vector = terms.gradient - cross.T @ solved[:, -1] + information @ cameras.xi.ravel()
+    return CameraEvidence(0.5 * (information + information.T), vector)
