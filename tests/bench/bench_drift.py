@@ -24,6 +24,7 @@ from drift_world import (
     direction,
     random_move,
 )
+from numpy.typing import NDArray
 from scipy.stats import beta, chi2
 
 from station.calibration.drift.alignment import estimate_move
@@ -184,7 +185,7 @@ def _detection(moved: list[Trial], limit: list[Trial]) -> None:
     print(f"  of all moves at or beyond the limit {100 * named[whole >= 1].mean():.0f} % are named")
 
 
-def _rate(named: Array, among: Array) -> str:
+def _rate(named: NDArray[np.bool_], among: NDArray[np.bool_]) -> str:
     count = int(among.sum())
     return f"{100 * named[among].mean():>6.0f} % " if count else f"{'-':>8} "
 

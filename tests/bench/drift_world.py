@@ -85,7 +85,7 @@ def leaning(mesh: Mesh, lean_m: float) -> Mesh:
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """What stands in the booth during one scan, twice: before and after half a sway."""
+    """Scene of one scan, twice: before and after half a sway."""
 
     kind: Scene
     moments: tuple[VirtualScene, ...]
@@ -133,8 +133,8 @@ class DriftBooth:
         if kind == "bag":
             angle, away = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.5)
             bag = box((-0.2, -0.12, 0.0), (0.2, 0.12, rng.uniform(0.25, 0.5)))
-            at = away * np.array([np.cos(angle), np.sin(angle)])
-            things.append(placed(bag, *at, rng.uniform(0.0, np.pi)))
+            x, y = away * np.cos(angle), away * np.sin(angle)
+            things.append(placed(bag, x, y, rng.uniform(0.0, np.pi)))
         if kind == "chair moved":
             angle = rng.uniform(0.0, 2.0 * np.pi)
             # From a nudge, which looks like a moved camera, to another place.

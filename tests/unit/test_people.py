@@ -20,12 +20,9 @@ from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig, load_config
 from station.core.errors import CalibrationError
-from station.core.files import write_json
 from station.core.geometry import se3_exp
 from station.core.rig import Rig
 from station.simulation.scene import default_rig
-from workers.cloud.observed import CameraView
-from workers.reconstruct.job_handle import EVIDENCE
 from workers.reconstruct.pool import CAMERAS, keep_evidence
 from workers.scape.evidence.cameras import CameraEvidence
 
@@ -65,8 +62,8 @@ def test_the_camera_that_drifted_is_named_with_its_move(camera: str) -> None:
     millimetres = round(1e3 * float(np.linalg.norm(drift.xi[3:])))
     assert drift.words() == (
         f"camera {camera} seems to have moved since it was calibrated, as the scans of the last "
-        f"people say: by about {millimetres} mm (mostly forward) and 0.2 degrees (mostly to the right); run "
-        "station check --correct"
+        f"people say: by about {millimetres} mm (mostly forward) and 0.2 degrees (mostly to the "
+        "right); run station check --correct"
     )
 
 
@@ -95,7 +92,8 @@ def test_a_drift_that_half_of_the_people_deny_is_not_corrected() -> None:
 def config(tmp_path: Path) -> BoothConfig:
     """A booth with a stored calibration in use."""
     cameras = "".join(
-        f'[[cameras]]\nname = "{name}"\nserial = "V{index}"\ndriver = "recorded"\nrecording = "{name}"\n'
+        f'[[cameras]]\nname = "{name}"\nserial = "V{index}"\n'
+        f'driver = "recorded"\nrecording = "{name}"\n'
         for index, name in enumerate(NAMES)
     )
     path = tmp_path / "booth.toml"
@@ -109,24 +107,16 @@ def config(tmp_path: Path) -> BoothConfig:
 
 
 def _keep(config: BoothConfig, people: list[Evidence], created: str) -> None:
-    """As a worker does: in its frames, through the result's folder."""
-    views = []
-    for name in NAMES:
-        view = object.__new__(CameraView)
-        object.__setattr__(view, "name", name)
-        object.__setattr__(view, "calibration", RIG.cameras[name])
-        views.append(view)
-    result = config.spool.folder / "tmp"
-    result.mkdir(parents=True, exist_ok=True)
+    """As a worker does."""
     turn = np.zeros((6 * len(NAMES),) * 2)
     for index, name in enumerate(np.repeat(NAMES, 2)):
         own = slice(3 * index, 3 * index + 3)
         turn[own, own] = RIG.cameras[name].world_from_camera[:3, :3]
     for scan in people:
         evidence = CameraEvidence(turn @ scan.information @ turn.T, turn @ scan.vector)
-        write_json(result / EVIDENCE, evidence.document(views, created))
-        keep_evidence(result, config.spool.folder / CAMERAS)
-        assert not (result / EVIDENCE).exists()
+        keep_evidence(
+            evidence.document(list(RIG.cameras.values()), created), config.spool.folder / CAMERAS
+        )
 
 
 def test_a_correction_is_a_dated_calibration_in_use(config: BoothConfig) -> None:
@@ -171,8 +161,7 @@ def test_what_is_kept_names_nobody_and_is_bounded(config: BoothConfig) -> None:
             "format", "version", "calibration", "cameras", "information", "vector",
         }  # fmt: skip
     for number in range(70):
-        (config.spool.folder / "tmp" / EVIDENCE).write_text("torn")
-        keep_evidence(config.spool.folder / "tmp", folder)
+        keep_evidence({"format": "booth-camera-evidence", "version": 1}, folder)
         assert len(list(folder.iterdir())) <= 60, number
-    # Torn files are passed over.
+    # Files without content are passed over.
     assert problem_in_words(config) == []

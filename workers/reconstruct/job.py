@@ -6,16 +6,16 @@ filter the depth images, fit the SCAPE model to them, measure the body.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from station.core.bundle import read_bundle
 from station.core.config import Volume
-from station.core.files import write_json
 from station.core.rig import PredictedError
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
@@ -27,7 +27,6 @@ from workers.export.result import write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
 from workers.measure.intervals import ScanErrors
-from workers.reconstruct.job_handle import EVIDENCE
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
     Method,
@@ -54,6 +53,8 @@ class JobSummary:
     status: str
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
+    evidence: Mapping[str, Any] | None = None
+    """Document of format "booth-camera-evidence" of a scan that is accepted."""
 
 
 def warm_up() -> BodyModel:
@@ -152,11 +153,13 @@ def _fitted(
         watch.seconds.update(fit.seconds)
         progress("writing", 0.0)
         write_result(out_folder, model, fit, fit.cloud, measured, standing, origin, method, watch)
-        if overlapping.evidence is not None and fit.verdict.status == "ok" and origin.calibration:
-            document = overlapping.evidence.document(scan.views, origin.calibration)
-            write_json(out_folder / EVIDENCE, document, durable=False)
     progress("done", 1.0)
-    return JobSummary(fit.verdict.status, fit.verdict.reasons)
+    evidence = None
+    if overlapping.evidence is not None and fit.verdict.status == "ok":
+        evidence = overlapping.evidence.document(
+            [view.calibration for view in scan.views], origin.calibration
+        )
+    return JobSummary(fit.verdict.status, fit.verdict.reasons, evidence)
 
 
 def _measured(

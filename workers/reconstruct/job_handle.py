@@ -12,15 +12,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from station.core.config import BoothConfig
 
-EVIDENCE = "cameras.json"
-"""File of a result with what the scan says of its cameras' places; the pool takes it out."""
 _LOOK_S = 0.2
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
@@ -38,6 +36,8 @@ class Outcome:
     reason: str = ""
     """Reason to scan again, or reason why there is no result."""
     blame: Blame = "nobody"
+    evidence: Mapping[str, Any] | None = None
+    """Document of format "booth-camera-evidence"; None if the scan says nothing of its cameras."""
 
 
 class JobProcess:
@@ -93,7 +93,12 @@ class JobProcess:
         if "status" in last and process.returncode == 0:
             reasons = last.get("reasons")
             words = "; ".join(map(str, reasons)) if isinstance(reasons, list) else ""
-            return Outcome(status=str(last["status"]), reason=words)
+            evidence = last.get("evidence")
+            return Outcome(
+                status=str(last["status"]),
+                reason=words,
+                evidence=evidence if isinstance(evidence, dict) else None,
+            )
         return _died(process.returncode)
 
     def _last_message(

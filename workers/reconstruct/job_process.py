@@ -1,9 +1,9 @@
 """A process that warms up, does one job and ends: what it holds or leaks ends with it.
 
 Communicates by JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method",
-"volume"}, reports {"step", "share"} and ends with {"status", "reasons"}, {"error"} (the scan cannot
-be used), {"disk"} (the disk refused, not the fault of the scan) or {"died"}. Its first argument is
-the process to end with.
+"volume"}, reports {"step", "share"} and ends with {"status", "reasons", "evidence"}, {"error"} (the
+scan cannot be used), {"disk"} (the disk refused, not the fault of the scan) or {"died"}. Its first
+argument is the process to end with.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ MEMORY_BYTES = 2 << 30
 
 
 def _say(channel: int, message: dict[str, Any]) -> None:
-    os.write(channel, (json.dumps(message) + "\n").encode())
+    left = (json.dumps(message) + "\n").encode()
+    while left:
+        left = left[os.write(channel, left) :]
 
 
 def main() -> None:
@@ -69,7 +71,14 @@ def main() -> None:
         traceback.print_exc()
         _say(channel, {"died": f"the job ended unexpectedly ({type(error).__name__}: {error})"})
         return
-    _say(channel, {"status": summary.status, "reasons": list(summary.reasons)})
+    _say(
+        channel,
+        {
+            "status": summary.status,
+            "reasons": list(summary.reasons),
+            "evidence": summary.evidence,
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -13,17 +13,19 @@ import shutil
 import threading
 import time
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.files import private_folder, write_bytes
+from station.core.files import private_folder, write_json
 from station.core.scans import ScanId
 from station.core.service import Heartbeat, set_up_logs, stop_event
 from station.core.spool import MAX_DEATHS, Claim, Spool
-from workers.reconstruct.job_handle import EVIDENCE, JobProcess, Outcome
+from workers.reconstruct.job_handle import JobProcess, Outcome
 
 CAMERAS = "cameras"
 """Folder of the spool that gathers what scans say of the cameras, nameless and out of order."""
@@ -103,7 +105,8 @@ class Worker:
         process.send(claim.bundle, out, self._config)
         outcome = process.outcome(self._config.workers.timeout_s, self._stop, self._warm_another)
         if outcome.status:
-            keep_evidence(out, self._spool.folder / CAMERAS)
+            if outcome.evidence is not None:
+                keep_evidence(outcome.evidence, self._spool.folder / CAMERAS)
             claim.deliver(out, outcome.status, outcome.reason)
             self.delivered += 1
             self._log.info("scan %s delivered", claim.scan_id, extra={"scan": claim.scan_id})
@@ -140,17 +143,14 @@ class Worker:
             self._log.warning(words, claim.scan_id, outcome.reason, extra=about)
 
 
-def keep_evidence(result: Path, folder: Path) -> None:
-    """Move what a result says of its cameras to that of other scans, under a name that tells
-    neither the scan nor its time; the oldest beyond _KEPT go.
+def keep_evidence(document: Mapping[str, Any], folder: Path) -> None:
+    """Put what a scan says of its cameras to that of other scans, under a name that tells neither
+    the scan nor its time; the oldest beyond _KEPT go.
 
     Losing it loses nothing else: errors of the disk are those of the delivery that follows.
     """
-    path = result / EVIDENCE
     try:
-        content = path.read_bytes()
-        path.unlink()
-        write_bytes(private_folder(folder) / f"{uuid.uuid4().hex}.json", content)
+        write_json(private_folder(folder) / f"{uuid.uuid4().hex}.json", document)
         kept = sorted(folder.glob("*.json"), key=lambda entry: entry.stat().st_mtime)
         for old in kept[:-_KEPT]:
             old.unlink(missing_ok=True)

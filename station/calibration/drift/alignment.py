@@ -34,12 +34,12 @@ _CORRELATION = 2.5
 variances of their sums are this much larger."""
 _FLOOR_PER_M = 2e-5
 """Error that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
-_COMMON_SIGMA = np.array([2.5e-5, 5e-5, 1.0])
-"""Of `DriftReference.common`: warmth changes the depth of a warm sensor by 0.1 mm at 1.7 m,
-and a silhouette loses a pixel more on one day than on another."""
-_LOCAL_SIGMA = np.array([1e-4, 0.2, 0.2, 0.5])
-"""Of `DriftReference.local`: a sensor's bias differs by about 0.3 mm at 1.7 m where another
-part of the image sees a surface, and outlines by fifths of a pixel."""
+_COMMON_SIGMA = np.array([5e-5, 1e-4, 1.0])
+"""Standard deviations of `DriftReference.common`: warmth changes the depth of a warm sensor by
+0.2 mm at 1.7 m, and a silhouette loses a pixel more on one day than on another."""
+_LOCAL_SIGMA = np.array([2e-4, 0.3, 0.3, 0.5])
+"""Standard deviations of `DriftReference.local`: a sensor's bias differs by about 0.6 mm at 1.7 m
+where another part of the image sees a surface, and outlines by thirds of a pixel."""
 _SYSTEMATIC_M, _RELATIVE = 3e-4, 0.05
 """Errors of a move that no sample shows: of the lens and the bias over the whole image, and as a
 share of the move, for the bias stays in the image while the booth moves through it."""
@@ -169,7 +169,7 @@ def _solved(
         information += normal[:border, :border] - normal[:border, border:] @ solved[:, :border]
         gradient += right[:border] - normal[:border, border:] @ solved[:, border]
         eliminated.append(solved)
-    change = np.linalg.solve(information, gradient)
+    change: Array = np.asarray(np.linalg.solve(information, gradient), np.float64)
     explained = design[:, 6:border] @ change[6:]
     owns = np.array([solved[:, border] - solved[:, :border] @ change for solved in eliminated])
     for start, end, own in zip(edges[:-1], edges[1:], owns, strict=True):

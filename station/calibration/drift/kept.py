@@ -1,4 +1,4 @@
-"""What the scans of the last people said of the cameras, on disk, and the correction made from it.
+"""Evidence of the last people's scans about the cameras, on disk, and the correction made from it.
 
 The workers put one small file of each accepted scan into the spool's `cameras` folder. It bears
 neither the scan's name nor its time, and holds sums from which no body can be rebuilt.

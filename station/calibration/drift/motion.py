@@ -25,7 +25,8 @@ LEVER_M = MOVED_M / MOVED_RAD
 MIN_SHARE = 0.15
 """Less of the stored background than this tells nothing."""
 _CERTAINTY = 2.0
-"""Standard deviations from the nearest move within the tolerance beyond which a camera alarms ..."""
+"""A camera alarms if it is so many standard deviations from the nearest move within the tolerance
+..."""
 _NOT_STILL = 5.0
 """... if it is also so far from none at all: of a camera that stands still, in the three directions
 in which errors may exceed the tolerance, once in 60,000 views, if errors are as stated."""
@@ -39,7 +40,8 @@ _SIDES = (
     ("up", "down"), ("to the right", "to the left"), ("clockwise", "anticlockwise"),
     ("to the right", "to the left"), ("down", "up"), ("forward", "back"),
 )  # fmt: skip
-"""Where a positive and a negative component of xi turn or shift a camera, as it looks."""
+"""Directions in which a positive and a negative component of xi turn or shift a camera, as it
+looks."""
 _UNSEEN = (
     "tilt up or down", "turn to the left or right", "roll", "shift sideways", "shift up or down",
     "shift forward or back",
@@ -73,7 +75,7 @@ class CameraMove:
     def alarm(self) -> float:
         """Distance from no move, and from the nearest within the tolerance, as a share of what
         alarms."""
-        information = np.linalg.inv(self.covariance * np.outer(_SCALE, _SCALE))
+        information = np.asarray(np.linalg.inv(self.covariance * np.outer(_SCALE, _SCALE)))
         size = self.xi * _SCALE
         from_still = float(np.sqrt(size @ information @ size))
         return min(_beyond_tolerance(size, information) / _CERTAINTY, from_still / _NOT_STILL)
@@ -151,7 +153,7 @@ def _direction_words(direction: Array) -> str:
     return f"{'turn' if first < 3 else 'shift'} obliquely ({together}, or the opposite)"
 
 
-def _beyond_tolerance(size: Array, information: Array) -> float:
+def _beyond_tolerance(size: Array, information: NDArray[np.floating]) -> float:
     """Mahalanobis distance of a move (6,), rotations times LEVER_M, from the nearest one within the
     tolerance: a ball of turns and a ball of shifts.
 

@@ -28,8 +28,8 @@ _NAMED_M = 0.0015
 _NAMED_RAD = float(np.radians(0.1))
 """Smaller drifts are not told: misfits that all bodies share ask for as much."""
 _CERTAINTY = 8.0
-"""Standard deviations, from the scatter over people, beyond which a drift is named. Hotelling's T of
-six numbers from 20 scans exceeds it once in 5,000 times (1931)."""
+"""Standard deviations, from the scatter over people, beyond which a drift is named. Hotelling's T
+(1931) of six numbers from 20 scans exceeds it once in 5,000 times."""
 _OTHERS = 1.5
 """The named camera must explain this many times more than any other could alone."""
 _HELPED = 2.5
@@ -65,9 +65,9 @@ class Evidence:
         vector = np.asarray(document["vector"], np.float64)
         size = 6 * len(cameras)
         if information.shape != (size, size) or vector.shape != (size,):
-            raise ValueError("evidence of other cameras than it names")
+            raise ValueError("wrong shape")
         if not (np.isfinite(information).all() and np.isfinite(vector).all()):
-            raise ValueError("evidence must be finite")
+            raise ValueError("not finite")
         return cls(cameras, information, vector)
 
 
@@ -133,7 +133,7 @@ class _Motion:
     xi: Array
     covariance: Array
     gain: float
-    """What it adds to the log-likelihood."""
+    """Increase of the log-likelihood."""
     sigmas: float
     """Its Mahalanobis length."""
 

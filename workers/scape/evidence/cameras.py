@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.geometry import rigid, so3_exp
+from station.core.rig import CameraCalibration
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.model.kernels import transform_groups
 
@@ -118,8 +119,8 @@ class CameraCorrections:
 
 @dataclass(frozen=True, slots=True)
 class CameraEvidence:
-    """What one scan says of its cameras' places, whatever the body: the log-likelihood of the
-    corrections xi is vector . xi - xi . information xi / 2, maximised over the body.
+    """Log-likelihood of the cameras' corrections xi by one scan, maximised over the body:
+    vector . xi - xi . information xi / 2.
 
     It accumulates over people, with whom misfits of the body differ and a moved camera does not.
     """
@@ -129,14 +130,14 @@ class CameraEvidence:
     vector: Array
     """(6 C,)."""
 
-    def document(self, views: Sequence[CameraView], calibration: str) -> dict[str, Any]:
+    def document(self, cameras: Sequence[CameraCalibration], calibration: str) -> dict[str, Any]:
         """JSON of format "booth-camera-evidence", in each camera's own frame.
 
         Args:
-            views: the scan's views, in the order of the corrections.
+            cameras: in the order of the corrections.
             calibration: date of the calibration that the corrections refer to.
         """
-        turns = [view.calibration.world_from_camera[:3, :3] for view in views]
+        turns = [camera.world_from_camera[:3, :3] for camera in cameras]
         camera_from_world = np.zeros_like(self.information)
         for index, turn in enumerate(np.repeat(turns, 2, axis=0)):
             own = slice(3 * index, 3 * index + 3)
@@ -146,7 +147,7 @@ class CameraEvidence:
             "format": "booth-camera-evidence",
             "version": 1,
             "calibration": calibration,
-            "cameras": [view.name for view in views],
+            "cameras": [camera.name for camera in cameras],
             "information": np.round(turned, 3).tolist(),
             "vector": np.round(camera_from_world @ self.vector, 3).tolist(),
         }

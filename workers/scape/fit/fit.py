@@ -117,7 +117,7 @@ class OverlappingFit:
     iterations: int
     camera_shifts_m: dict[str, float]
     evidence: CameraEvidence | None
-    """What the scan says of its cameras' places."""
+    """Evidence of the scan about its cameras' places."""
     seconds: dict[str, float]
 
 
