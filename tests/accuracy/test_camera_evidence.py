@@ -33,10 +33,11 @@ def _motions(folder: Path, moved: dict[str, tuple[float, float]]) -> dict[str, N
     assert fit.evidence is not None
     document = fit.evidence.document([view.calibration for view in scan.views], "2026")
     found = Evidence.from_json(document)
-    motions = {}
+    motions: dict[str, NDArray[np.float64]] = {}
     for index, name in enumerate(found.cameras):
         own = slice(6 * index, 6 * index + 6)
-        motions[name] = np.linalg.solve(found.information[own, own], found.vector[own])
+        motion = np.linalg.solve(found.information[own, own], found.vector[own])
+        motions[name] = np.asarray(motion, np.float64)
     return motions
 
 
