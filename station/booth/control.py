@@ -31,7 +31,14 @@ import zmq
 from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
 from station.booth.retention import expire_old
-from station.booth.session import CANCELLED, UNSURE, Session, overdue, state_of
+from station.booth.session import (
+    CANCELLED,
+    MAX_LABEL_LENGTH,
+    UNSURE,
+    Session,
+    overdue,
+    state_of,
+)
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
@@ -172,6 +179,12 @@ class ControlProcess:
         scan_id = scan_id_of(request.scan_id)
         if (known := self._known(scan_id)) is not None:
             return Reply(ok=True, content=known)
+        if len(request.label) > MAX_LABEL_LENGTH:
+            return Reply(
+                ok=False,
+                error=f"the label has {len(request.label)} characters, {MAX_LABEL_LENGTH} are "
+                "allowed; shorten it; no scan was started",
+            )
         if not self._streaming:
             return Reply(ok=False, error="the sensors are stopped; run station start first")
         now_s = time.monotonic()

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from station.booth.health import MAX_AGE_S, booth_health
-from station.booth.session import FINAL, ON_DISK, UNSURE
+from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
@@ -26,7 +26,6 @@ _POLL_S = 0.05
 _EXIT_RESCAN = 3
 _UNSURE_S = 15.0
 """Time within which a process that hangs is restarted and the outcome of a scan is known again."""
-_MAX_LABEL_LENGTH = 200
 _LOCKS = (STATION_LOCK, "control.lock", "sync.lock")
 _WORDS = {
     "armed": "waiting for the cameras",
@@ -296,7 +295,7 @@ def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]
 def _text(label: str) -> str:
     """A label, with unprintable characters removed."""
     text = label.encode(errors="surrogateescape").decode(errors="replace")
-    return "".join(letter if letter.isprintable() else " " for letter in text)[:_MAX_LABEL_LENGTH]
+    return "".join(letter if letter.isprintable() else " " for letter in text)[:MAX_LABEL_LENGTH]
 
 
 def _show_result(path: str) -> None:

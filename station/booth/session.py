@@ -22,6 +22,8 @@ ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered"
 CANCELLED = "cancelled by the operator"
 """Reason of a scan that failed because it was cancelled."""
 UNSURE = "outcome not known yet; do not scan again"
+MAX_LABEL_LENGTH = 200
+"""Characters; a note of a scan is read up to a limit."""
 
 
 @dataclass(frozen=True, slots=True)

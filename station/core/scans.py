@@ -53,6 +53,8 @@ STATES = ("queue", "work", "outbox", "failed", "done")
 REASON = "reason.json"
 _BUNDLE_BYTES = 40 << 20
 """Larger than a bundle of forty depth frames."""
+_FILES = 200
+"""More than a bundle of forty depth frames and its result."""
 
 Stage = Literal["armed", "capturing", "accepted", "delivering", "delivered", "failed"]
 
@@ -186,7 +188,8 @@ class ScanFolders:
         """Refuse a scan before it is taken, rather than lose it after.
 
         Raises:
-            SpoolError: naming the folder and the space that is missing, or why it takes no files.
+            SpoolError: naming the folder and the space or the files that are missing, or a part
+                of it in another file system, where nothing can be renamed to.
         """
         free = shutil.disk_usage(self.folder).free
         needed = min_free_mb * 1e6 + _BUNDLE_BYTES
@@ -195,6 +198,19 @@ class ScanFolders:
                 f"{self.folder} has {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB are needed "
                 "(spool.min_free_mb); free some space or run: station purge --old"
             )
+        inodes = os.statvfs(self.folder)
+        # File systems that have no fixed number of files say 0 of 0.
+        if inodes.f_files and inodes.f_favail < _FILES:
+            raise SpoolError(
+                f"{self.folder} has room for {inodes.f_favail} more files, {_FILES} are needed; "
+                "remove files from its file system or run: station purge --old"
+            )
+        for name in ("tmp", *STATES):
+            if (self.folder / name).stat().st_dev != self.folder.stat().st_dev:
+                raise SpoolError(
+                    f"{self.folder / name} lies in another file system than {self.folder}; "
+                    "move it back: a spool must be in one"
+                )
 
     def where(self, scan_id: str) -> str | None:
         """The state of a scan, or None if it is in none of the folders.

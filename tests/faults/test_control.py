@@ -65,3 +65,10 @@ def test_a_disk_that_cannot_be_read_is_no_refusal(
 def test_a_scan_that_nobody_ordered_is_none(control: ControlProcess) -> None:
     with pytest.raises(BoothError, match="there is no scan b"):
         control._reply(Request("scan-status", "b"))
+
+
+def test_a_label_that_no_note_holds_is_refused(control: ControlProcess) -> None:
+    reply = control._reply(Request("scan", "c", "x" * 10_000, 1e9))
+    assert not reply.ok
+    assert "the label has 10000 characters" in reply.error
+    assert not list((control._spool.folder / "scans").iterdir())

@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -249,6 +250,31 @@ def test_a_lock_file_that_could_not_be_removed_is_removed_later(
     Spool(tmp_path).recover(2)
     assert [path.stem for path in (tmp_path / "locks").iterdir()] == ["b"]
     spool.unlock(ScanId("b"), held)
+
+
+def test_a_spool_in_two_file_systems_is_refused_before_a_scan(tmp_path: Path) -> None:
+    elsewhere = Path("/dev/shm") / f"booth-test-{os.getpid()}"
+    elsewhere.mkdir()
+    try:
+        (tmp_path / "queue").symlink_to(elsewhere)
+        with pytest.raises(SpoolError, match="queue lies in another file system"):
+            Spool(tmp_path).check_space(0.0)
+    finally:
+        elsewhere.rmdir()
+
+
+def test_a_file_system_that_takes_no_more_files_is_refused_before_a_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = Spool(tmp_path)
+    spool.check_space(0.0)
+    full = SimpleNamespace(f_files=1000, f_favail=7)
+    monkeypatch.setattr("station.core.scans.os.statvfs", lambda _: full)
+    monkeypatch.setattr(
+        "station.core.scans.shutil.disk_usage", lambda _: SimpleNamespace(free=1e12)
+    )
+    with pytest.raises(SpoolError, match="room for 7 more files, 200 are needed"):
+        spool.check_space(0.0)
 
 
 def _refuse(*_: object, **__: object) -> None:
