@@ -152,10 +152,13 @@ def _false_alarms(still: list[Trial], small: list[Trial]) -> None:
         # Clopper and Pearson 1934, one-sided.
         bound = float(beta.ppf(0.95, len(named) + 1, max(1, len(scans) - len(named))))
         share = len(named) / max(1, len(scans))
+        verdict = "missed" if share >= FALSE_ALARMS_BAR else "not shown by so few scans"
+        if bound < FALSE_ALARMS_BAR:
+            verdict = "met"
         print(
             f"  {name}: scans refused for nothing: {len(named)} of {len(scans)} ({share:.4f}), at "
             f"95 % confidence below {bound:.4f}   (bar: < {FALSE_ALARMS_BAR:g}; "
-            f"{'met' if share < FALSE_ALARMS_BAR else 'missed'})"
+            f"{verdict})"
         )
 
 
@@ -195,6 +198,8 @@ def _sizes(group: list[Trial]) -> None:
     print("\nStated sizes and directions")
     for scene in SCENES:
         mine = [t for t in group if t.scene == scene and not t.move.lost]
+        if not mine:
+            continue
         inside = np.mean([t.chi2 < limit for t in mine])
         errors = 1e3 * np.array([(t.move.xi - t.true) * SCALE for t in mine])
         known = 1e3 * np.array([_known_error(t) for t in mine])
