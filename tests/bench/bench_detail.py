@@ -20,7 +20,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import open3d as o3d
+from fit_cases import on_the_mark
 from numpy.typing import NDArray
+from surface_errors import ray_scene
 from unlike_bodies import UnlikeBodies
 
 from station.core.bundle import Bundle, read_bundle
@@ -90,6 +92,62 @@ def guided(radius_px: int, sigmas: float) -> Callable[[Image, float], Image]:
     return smooth
 
 
+def generalised_variation(weight: float, rounds: int = 150) -> Callable[[Image, float], Image]:
+    """Total generalised variation of second order (Bredies, Kunisch & Pock 2010), which bends
+    slopes freely and punishes changes of the slope; by the primal-dual method of Chambolle & Pock
+    2011."""
+
+    def smooth(depth: Image, typical_m: float) -> Image:
+        rows, columns = (np.flatnonzero((depth > 0.0).any(axis=axis)) for axis in (1, 0))
+        crop = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        sigma = float(random_sigma_m(np.array(typical_m)))
+        data = (depth[crop] - typical_m) / sigma
+        known = depth[crop] > 0.0
+        joined = known[:, :-1] & known[:, 1:], known[:-1] & known[1:]
+        u, v = np.where(known, data, 0.0), np.zeros((2, *data.shape))
+        u_bar, v_bar, step = u, v, 1.0 / np.sqrt(12.0)
+        p, q = np.zeros_like(v), np.zeros((4, *data.shape))
+        for _ in range(rounds):
+            p = _within(p + step * (_slopes(u_bar, joined) - v_bar), weight)
+            bend = np.concatenate([_slopes(one, joined) for one in v_bar])
+            q = _within(q + step * bend, 2.0 * weight)
+            u_before, v_before = u, v
+            u = (u + step * (_divergence(p, joined) + np.where(known, data, 0.0))) / (1.0 + step)
+            lifted = np.stack([_divergence(q[i : i + 2], joined) for i in (0, 2)])
+            v = v + step * (p + lifted)
+            u_bar, v_bar = 2.0 * u - u_before, 2.0 * v - v_before
+        found = depth.copy()
+        found[crop] = np.where(known, typical_m + sigma * u, 0.0)
+        return found
+
+    return smooth
+
+
+def _slopes(image: Array, joined: tuple[NDArray[np.bool_], NDArray[np.bool_]]) -> Array:
+    """Forward differences (2, h, w), 0 across the border of what is known."""
+    found = np.zeros((2, *image.shape))
+    found[0, :, :-1] = np.where(joined[0], np.diff(image, axis=1), 0.0)
+    found[1, :-1] = np.where(joined[1], np.diff(image, axis=0), 0.0)
+    return found
+
+
+def _divergence(field: Array, joined: tuple[NDArray[np.bool_], NDArray[np.bool_]]) -> Array:
+    """Minus the adjoint of `_slopes`."""
+    found = np.zeros(field.shape[1:])
+    across = np.where(joined[0], field[0, :, :-1], 0.0)
+    down = np.where(joined[1], field[1, :-1], 0.0)
+    found[:, :-1] += across
+    found[:, 1:] -= across
+    found[:-1] += down
+    found[1:] -= down
+    return found
+
+
+def _within(field: Array, radius: float) -> Array:
+    """Each pixel's vector, shortened to a radius."""
+    return np.asarray(field / np.maximum(1.0, np.linalg.norm(field, axis=0) / radius))
+
+
 FILTERS: dict[str, Callable[[Image, float], Image]] = {
     "shipped": filtered,
     "mean of ten alone": mean_alone,
@@ -101,6 +159,8 @@ FILTERS: dict[str, Callable[[Image, float], Image]] = {
     "guided 2 px, 0.5": guided(2, 0.5),
     "guided 2 px, 1": guided(2, 1.0),
     "guided 3 px, 1": guided(3, 1.0),
+    "generalised variation, 0.2": generalised_variation(0.2),
+    "generalised variation, 0.5": generalised_variation(0.5),
 }
 
 
@@ -133,11 +193,7 @@ def band(depth: Array, mask: NDArray[np.bool_], metres_per_px: float) -> Array:
 
 def true_depth(camera: CameraCalibration, body: Mesh) -> tuple[Array, Array]:
     """Depth (h, w) of the true surface, 0 for none, and its places (h, w, 3)."""
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(body.vertices.astype(np.float32)),
-        o3d.core.Tensor(body.faces.astype(np.uint32)),
-    )
+    scene = ray_scene(body.vertices, body.faces)
     pose = camera.world_from_camera
     directions = rays(camera) @ pose[:3, :3].T
     origins = np.broadcast_to(pose[:3, 3], directions.shape)
@@ -176,11 +232,7 @@ def bodies(model: BodyModel, count: int) -> list[Mesh]:
     poses = 0.3 * database.sample_poses("validation", len(shapes), _SEED)
     plain = [Mesh(v, database.faces) for v in database.vertices(shapes, poses)]
     sculpted = [one.mesh for one in UnlikeBodies(model, "development").bodies(count // 2)]
-    return [
-        Mesh(mesh.vertices - (*(0.5 * np.ptp(mesh.vertices, axis=0)
-                                + mesh.vertices.min(axis=0))[:2], 0.0), mesh.faces)
-        for mesh in (*plain, *sculpted)
-    ]  # fmt: skip
+    return [on_the_mark(mesh.vertices, mesh.faces) for mesh in (*plain, *sculpted)]
 
 
 def main() -> None:
@@ -188,13 +240,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--bodies", type=int, default=12)
+    parser.add_argument("--sway", type=float, default=0.001, help="amplitude at the head, metres")
     arguments = parser.parse_args()
     model = warm_up()
     table = {feature: {name: Sums() for name in FILTERS} for feature in _FEATURES}
     with tempfile.TemporaryDirectory() as folder:
         for index, body in enumerate(bodies(model, arguments.bodies)):
             path = Path(folder) / f"{index:02d}"
-            render_bundle(body, path, SimulatedBooth(seed=index, sway_m=0.001))
+            render_bundle(body, path, SimulatedBooth(seed=index, sway_m=arguments.sway))
             bundle = read_bundle(path)
             for feature, landmarks in _FEATURES.items():
                 at = body.vertices[[model.landmarks[name] for name in landmarks]]

@@ -106,8 +106,7 @@ class TestBodies:
 
     def _made(self, shapes: Shapes, pose: Array) -> Mesh:
         vertices = self._database.vertices(shapes, pose[None])[0]
-        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        return Mesh(vertices - (middle[0], middle[1], 0.0), self._database.faces)
+        return on_the_mark(vertices, self._database.faces)
 
 
 def family_cases(bodies: TestBodies, count: int) -> Iterator[Case]:
@@ -236,6 +235,12 @@ def sampled(body: Mesh, count: int) -> PointCloud:
         camera=np.zeros(len(points), np.int16),
         camera_names=("cloud",),
     )
+
+
+def on_the_mark(vertices: Array, faces: NDArray[np.int32]) -> Mesh:
+    """A body moved level, its middle to where a person should stand."""
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    return Mesh(vertices - (middle[0], middle[1], 0.0), faces)
 
 
 def scaled(body: Mesh, stature_m: float) -> Mesh:

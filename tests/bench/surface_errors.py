@@ -49,23 +49,25 @@ class SurfaceErrors:
         return max(self.by_part.items(), key=lambda item: item[1])
 
 
-def distances_m(vertices: Array, faces: NDArray[np.int32], points: Array) -> Array:
-    """(n,): from points to a surface."""
+def ray_scene(vertices: Array, faces: NDArray[np.int32]) -> o3d.t.geometry.RaycastingScene:
+    """Surface to which rays and distances can be found."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
     )
+    return scene
+
+
+def distances_m(vertices: Array, faces: NDArray[np.int32], points: Array) -> Array:
+    """(n,): from points to a surface."""
+    scene = ray_scene(vertices, faces)
     found = scene.compute_distance(o3d.core.Tensor(points.astype(np.float32)))
     return np.asarray(found.numpy(), np.float64)
 
 
 def _nearest_places(truth: Mesh, points: Array) -> Array:
     """(n, 3): places of a true surface next to points."""
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(truth.vertices.astype(np.float32)),
-        o3d.core.Tensor(truth.faces.astype(np.uint32)),
-    )
+    scene = ray_scene(truth.vertices, truth.faces)
     found = scene.compute_closest_points(o3d.core.Tensor(points.astype(np.float32)))
     return np.asarray(found["points"].numpy(), np.float64)
 

@@ -182,7 +182,8 @@ def filtered(depth_m: Image, typical_m: float) -> Image:
         _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical_m))),
         _BILATERAL_SPACE_PX,
     )
-    return np.where(depth_m > 0, smooth, np.float32(0.0)).astype(np.float32)
+    smooth[depth_m == 0.0] = 0.0
+    return np.asarray(smooth, np.float32)
 
 
 def _ordered(bundle: Bundle, name: str) -> int:

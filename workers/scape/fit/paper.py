@@ -8,6 +8,7 @@ E(Y') = sum_p |M(p) - Y'(p)|^2 + w sum_i |Y'(p_i) - T(q_i)|^2 with w = 1.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,10 @@ _MAX_ALIGNMENTS = 20
 _SETTLED_M = 5e-4
 """Rms change of the mesh below which the loop ends."""
 _MIN_PAIRS = 50
+_UNPAIRED_WEIGHT = 0.05
+"""Weight of a vertex without a pair in step (b), where one with a pair has 1."""
+_MIN_PAIRED = 0.2
+"""Share of a part's vertices with pairs from which its own rotation is solved."""
 _SHAPE_RIDGE = 1e-3
 """Ridge of the shape's energy, as a share of its mean diagonal."""
 
@@ -54,7 +59,7 @@ def fit_like_the_paper(
         mesh, pairs = align_rigidly(model, target, mesh)
         on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
         observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
-        state = solve_pose_and_shape(model, mesh, pairs, target)
+        state = solve_pose_and_shape(model, mesh, state, pairs, target)
         solved = solve_mesh(model.vertices(state), pairs, target)
         change_m = float(np.sqrt(np.mean(np.sum((solved - mesh) ** 2, axis=1))))
         mesh = solved
@@ -111,11 +116,29 @@ def align_rigidly(model: BodyModel, target: Target, mesh: Array) -> tuple[Array,
     return mesh, pairs
 
 
-def solve_pose_and_shape(model: BodyModel, mesh: Array, pairs: Pairs, target: Target) -> BodyState:
+def solve_pose_and_shape(
+    model: BodyModel, mesh: Array, state: BodyState, pairs: Pairs, target: Target
+) -> BodyState:
     """Step (b): theta, then beta, each by its own energy, for the mesh moved to its pairs."""
     goal = mesh.copy()
     goal[pairs[0]] = target.tree.points[pairs[1]]
-    return model.project(goal, iterations=2, ridge=_SHAPE_RIDGE)
+    weight = np.full(len(mesh), _UNPAIRED_WEIGHT)
+    weight[pairs[0]] = 1.0
+    found = model.project(goal, iterations=2, ridge=_SHAPE_RIDGE, weight=weight)
+    return _followed(model, state, found, weight)
+
+
+def _followed(model: BodyModel, before: BodyState, found: BodyState, weight: Array) -> BodyState:
+    """A state in which parts with few pairs turn with their parents: an arm that is farther away
+    than pairs reach comes nearer with its shoulder."""
+    rotations = found.rotations.copy()
+    paired = model.vertex_weights.T @ weight / model.vertex_weights.sum(axis=0)
+    for part, parent in enumerate(model.part_parents):
+        if parent >= 0 and paired[part] < _MIN_PAIRED:
+            rotations[part] = (
+                rotations[parent] @ before.rotations[parent].T @ before.rotations[part]
+            )
+    return replace(found, rotations=rotations)
 
 
 def solve_mesh(model_mesh: Array, pairs: Pairs, target: Target) -> Array:

@@ -215,35 +215,51 @@ class BodyModel:
         blended = (self.vertex_weights @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
         return self.vertices(new_state) + np.einsum("vij,vj->vi", blended, beyond)
 
-    def part_rotations(self, surface: Array, vertices: Array) -> Array:
-        """Rotations (L, 3, 3) of the parts from a neutral surface to a posed one."""
+    def part_rotations(self, surface: Array, vertices: Array, weight: Array | None = None) -> Array:
+        """Rotations (L, 3, 3) of the parts from a neutral surface to a posed one.
+
+        Args:
+            weight: (P,), of the vertices; all alike by default. A triangle has its corners' mean.
+        """
         source, target = edges(surface, self.faces), edges(vertices, self.faces)
         weights = self.triangle_part_weights**2 * self.solver.triangle_weights[:, None]
+        if weight is not None:
+            weights = weights * weight[self.faces].mean(axis=1)[:, None]
         products = np.einsum("kei,kej->kij", target, source).reshape(-1, 9)
         return nearest_rotation((weights.T @ products).reshape(-1, 3, 3))
 
-    def project(self, vertices: Array, iterations: int = 6, ridge: float = 1e-4) -> BodyState:
+    def project(
+        self,
+        vertices: Array,
+        iterations: int = 6,
+        ridge: float = 1e-4,
+        weight: Array | None = None,
+    ) -> BodyState:
         """State whose body is close to a mesh (P, 3) in the template's topology.
 
         Alternates closed forms: rotations of the parts by Procrustes, shape by ridge regression of
         the unposed surface on the components.
+
+        Args:
+            weight: (P,), of the vertices; all alike by default.
         """
+        weight = np.ones(len(vertices)) if weight is None else weight
         flat = self.directions.reshape(self.beta_count, -1)
-        mass = np.repeat(vertex_areas(self.mean, self.faces), 3).astype(np.float32)
+        mass = np.repeat(weight * vertex_areas(self.mean, self.faces), 3).astype(np.float32)
         weighted = flat * mass
         normal = (weighted @ flat.T).astype(np.float64)
         normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
         state = self.neutral_state()
         surface = self.mean
         for _ in range(iterations):
-            rotations = self.part_rotations(surface, vertices)
+            rotations = self.part_rotations(surface, vertices, weight)
             state = replace(state, rotations=rotations)
             pose = self.neutral_surface(replace(state, beta=np.zeros(self.beta_count)))
             offset = (self.unturned(vertices, rotations) - pose).ravel().astype(np.float32)
             state = replace(state, beta=np.linalg.solve(normal, (weighted @ offset).astype(float)))
             surface = self.neutral_surface(state)
         placed = self.vertices(state)
-        areas = vertex_areas(vertices, self.faces)
+        areas = weight * vertex_areas(vertices, self.faces)
         shift = areas @ (vertices - placed) / areas.sum()
         return replace(state, translation=state.translation + shift)
 
