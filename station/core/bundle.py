@@ -8,6 +8,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -71,7 +72,9 @@ class Bundle:
             BundleError: the file is missing, torn, or not a 16-bit image of the camera's size.
         """
         path = self.folder / record.file
-        if any(parent.is_symlink() for parent in path.parents if parent != self.folder.parent):
+        # Only links of the bundle itself: the spool may well lie behind one.
+        inside = takewhile(lambda parent: parent != self.folder.parent, path.parents)
+        if any(parent.is_symlink() for parent in inside):
             raise BundleError(f"{path} is reached through a symbolic link; scan again")
         calibration = self.rig.cameras[camera]
         expected = (calibration.height, calibration.width)

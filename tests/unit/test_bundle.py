@@ -134,6 +134,22 @@ def test_no_link_is_followed(bundle_folder: Path, target: str) -> None:
         read_bundle(bundle_folder).depth_stack("front")
 
 
+def test_a_folder_of_the_bundle_may_be_no_link(bundle_folder: Path, tmp_path: Path) -> None:
+    (bundle_folder / "depth").rename(tmp_path / "elsewhere")
+    (bundle_folder / "depth").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BundleError, match="reached through a symbolic link"):
+        read_bundle(bundle_folder).depth_stack("front")
+
+
+def test_a_spool_may_lie_behind_a_link(bundle_folder: Path, tmp_path: Path) -> None:
+    whole = read_bundle(bundle_folder).depth_stack("front")
+    (tmp_path / "real/queue").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    bundle_folder.rename(tmp_path / "real/queue/scan")
+    found = read_bundle(tmp_path / "link/queue/scan").depth_stack("front")
+    assert np.array_equal(found, whole)
+
+
 def test_no_pipe_is_waited_for(bundle_folder: Path) -> None:
     path = bundle_folder / "bundle.json"
     path.unlink()
