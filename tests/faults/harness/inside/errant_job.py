@@ -27,6 +27,7 @@ class QuickSummary:
 
     status: str = "ok"
     reasons: tuple[str, ...] = ()
+    evidence: None = None
 
 
 def warm_up() -> Any:
