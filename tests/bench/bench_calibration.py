@@ -22,7 +22,6 @@ from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import bench_drift
 import synthetic_calibration as synthetic
 from calibrated_booths import normalised_square, pair_errors, solved
 
@@ -180,7 +179,6 @@ def main() -> None:
     parser.add_argument("--booths", type=int, default=20)
     parser.add_argument("--first", type=int, default=1, help="seed of the first booth")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--scans", type=int, default=300, help="for the drift check; 0 = without")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.booths)
     print(
@@ -203,8 +201,6 @@ def main() -> None:
             )
     summary(rows, len(seeds))
     refusals()
-    if arguments.scans:
-        bench_drift.report(arguments.scans, max(10, arguments.scans // 10))
 
 
 if __name__ == "__main__":

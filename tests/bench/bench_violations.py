@@ -60,7 +60,7 @@ def observe(booth: SimulatedBooth, images: bool) -> Observations:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What one booth says about the honesty of its stated errors."""
+    """Honesty of one booth's stated errors."""
 
     words: str
     ratios: tuple[float, float, float] | None = None

@@ -46,8 +46,8 @@ TAPE_M = 0.001
 _TAIL = 4.0
 """Degrees of freedom (Student's t) of a contact: the ball may lie on something else."""
 _STAND_TAIL = 20.0
-"""Of a measured height, which is hardly wrong: sensors whose errors have an unexpected form must
-not push it aside."""
+"""Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
+unexpected form must not push it aside."""
 
 
 class NormalEquations:
@@ -294,7 +294,7 @@ class NormalEquations:
 
 
 def contact_error_m(problem: Problem, state: State, place: str) -> float:
-    """How much higher a ball rests than where it touches the floor or its stand."""
+    """Height (m) of a resting ball above where it touches the floor or its stand."""
     q = state.planes[FLOOR]
     length = np.linalg.norm(q)
     terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))

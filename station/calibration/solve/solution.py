@@ -197,7 +197,7 @@ def _advice(
     predicted: PredictedError, world_poses: WorldPoses, limits: Limits, coverage: Coverage,
     stood: bool,
 ) -> tuple[str, ...]:  # fmt: skip
-    """What could be better; ``stood``: the ball was on a stand."""
+    """Sentences on what could be better; ``stood``: the ball was on a stand."""
     weak = [] if coverage.enough else [coverage.advice()]
     if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
         weak.append(f"for heights, {refusals.remedy(stood)}")
