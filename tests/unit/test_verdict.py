@@ -104,6 +104,15 @@ def test_a_person_of_whom_one_side_is_missing_is_not_measured(model: BodyModel) 
     assert found.missing == ("abdomen",)
 
 
+def test_a_person_whose_left_side_is_missing_is_not_measured(model: BodyModel) -> None:
+    """A leg beside the other one may be seen even so: the trunk says that half of it is missing."""
+    parts = [PartReport("abdomen", 0.55, 1e-3), PartReport("thigh_left", 0.3, 1e-3)]
+    sides = {"front": 0.7, "back": 0.7, "left side": 0.5, "right side": 0.8}
+    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    assert found.reasons == ("the cameras saw only 50 % of the person's left side",)
+    assert found.missing == ("abdomen", "thigh_left")
+
+
 def test_something_beside_the_person_is_no_limb(model: BodyModel) -> None:
     cloud = _scan_of(model, model.mean)
     box = cloud.points[:, 2] < 0.25

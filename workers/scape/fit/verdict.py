@@ -43,10 +43,19 @@ _JUDGED_COMPONENTS = 10
 _POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
 """Points used for the report on parts, and for the comparison of starts."""
 _TRUNK = ("pelvis", "abdomen", "chest")
-_SIDES = {"front": -1.0, "back": 1.0}
-"""Signs of y: the template faces -y."""
-_FACING = 0.7
-"""Least y component of the normals of a side."""
+_SIDES = {
+    "front": (0.0, -1.0, 0.0),
+    "back": (0.0, 1.0, 0.0),
+    "left side": (1.0, 0.0, 0.0),
+    "right side": (-1.0, 0.0, 0.0),
+}
+"""Directions of the template's sides: it faces -y."""
+_FACING = {"front": 0.7, "back": 0.7, "left side": 0.2, "right side": 0.2}
+"""Least cosine between the normals of a side and its direction. Flanks hide behind arms, so what is
+left or right of them counts too."""
+_OTHER_SIDE = 0.75
+"""Share of the left side's coverage that the right side has at least, and the other way round: of
+half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 
 
@@ -116,16 +125,16 @@ def report_parts(
 
 
 def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
-    """Shares of the trunk's front and back that cameras saw.
+    """Shares of the trunk's front, back, left and right side that cameras saw.
 
     Coverage by part does not show that one side is missing: half of each part is then still seen.
     """
     areas = vertex_areas(vertices, model.faces)
-    toward = vertex_normals(model.mean, model.faces)[:, 1]
+    normals = vertex_normals(model.mean, model.faces)
     trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
     shares = {}
-    for side, sign in _SIDES.items():
-        there = trunk & (sign * toward > _FACING)
+    for side, direction in _SIDES.items():
+        there = trunk & (normals @ direction > _FACING[side])
         shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
     return shares
 
@@ -183,8 +192,10 @@ def judge(
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         reasons.append("what stands in the booth does not look like a person")
     halved = False
+    best = max((sides.get(f"{name} side", 0.0) for name in _LIMBS), default=0.0)
     for side, share in sides.items():
-        if share < _MIN_COVERAGE:
+        lateral = side.endswith("side") and share < _OTHER_SIDE * best
+        if share < _MIN_COVERAGE or lateral:
             reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
             halved = True
     missing = [name for name in lost if name]
