@@ -44,15 +44,13 @@ _POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
 """Points used for the report on parts, and for the comparison of starts."""
 _TRUNK = ("pelvis", "abdomen", "chest")
 _SIDES = {
-    "front": (0.0, -1.0, 0.0),
-    "back": (0.0, 1.0, 0.0),
-    "left side": (1.0, 0.0, 0.0),
-    "right side": (-1.0, 0.0, 0.0),
+    "front": ((0.0, -1.0, 0.0), 0.7),
+    "back": ((0.0, 1.0, 0.0), 0.7),
+    "left side": ((1.0, 0.0, 0.0), 0.2),
+    "right side": ((-1.0, 0.0, 0.0), 0.2),
 }
-"""Directions of the template's sides: it faces -y."""
-_FACING = {"front": 0.7, "back": 0.7, "left side": 0.2, "right side": 0.2}
-"""Least cosine between the normals of a side and its direction. Flanks hide behind arms, so what is
-left or right of them counts too."""
+"""Directions of the template's sides, which faces -y, and the least cosine between them and a
+side's normals. Flanks hide behind arms, so what faces them less counts too."""
 _OTHER_SIDE = 0.75
 """Share of the left side's coverage that the right side has at least, and the other way round: of
 half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
@@ -133,8 +131,8 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     normals = vertex_normals(model.mean, model.faces)
     trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
     shares = {}
-    for side, direction in _SIDES.items():
-        there = trunk & (normals @ direction > _FACING[side])
+    for side, (direction, least_cosine) in _SIDES.items():
+        there = trunk & (normals @ direction > least_cosine)
         shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
     return shares
 
