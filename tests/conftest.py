@@ -9,7 +9,26 @@ from pathlib import Path
 import pytest
 from running_station import STATION, Station
 
+from station.core.config import BoothConfig, load_config
+
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
+
+_ONE_CAMERA = """
+[[cameras]]
+name = "front-lower"
+driver = "recorded"
+recording = "front-lower"
+[spool]
+folder = "spool"
+"""
+
+
+@pytest.fixture
+def one_camera(tmp_path: Path) -> BoothConfig:
+    """Configuration of a booth of one camera, without recording and calibration."""
+    path = tmp_path / "booth.toml"
+    path.write_text(_ONE_CAMERA)
+    return load_config(path)
 
 
 @pytest.fixture(scope="session")

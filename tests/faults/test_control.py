@@ -6,32 +6,22 @@ import errno
 import logging
 import os
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from station.booth.control import ControlProcess
 from station.booth.session import UNSURE
-from station.core.config import load_config
+from station.core.config import BoothConfig
 from station.core.errors import BoothError
 from station.core.scans import Notes
 from station.messaging.messages import Request
 
-_CONFIG = """
-[[cameras]]
-name = "front-lower"
-driver = "recorded"
-recording = "front-lower"
-[spool]
-folder = "spool"
-"""
 _ORDER = Request("scan", "a", "", 1e9)
 
 
 @pytest.fixture
-def control(tmp_path: Path) -> Iterator[ControlProcess]:
-    (tmp_path / "booth.toml").write_text(_CONFIG)
-    process = ControlProcess(load_config(tmp_path / "booth.toml"), logging.getLogger())
+def control(one_camera: BoothConfig) -> Iterator[ControlProcess]:
+    process = ControlProcess(one_camera, logging.getLogger())
     process._reply(Request("start"))
     yield process
     process._context.destroy(linger=0)

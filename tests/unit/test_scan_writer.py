@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 import weakref
-from pathlib import Path
 
 import numpy as np
 
@@ -14,28 +13,18 @@ from station.booth.frameset import Frameset
 from station.booth.scan_writer import Ended, ScanWriter, Started
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
-from station.core.config import load_config
+from station.core.config import BoothConfig
 from station.core.scans import ScanId
 from station.messaging.intake import LiveFrame
 from station.messaging.messages import FrameHeader
 from station.simulation.scene import default_rig
 
-_CONFIG = """
-[[cameras]]
-name = "front-lower"
-driver = "recorded"
-recording = "front-lower"
-[spool]
-folder = "spool"
-"""
 _HEADER = FrameHeader("front-lower", "V1", 640, 480, 1e-4, 7, 6e7, 5.0, 5.0, 1, 0)
 
 
-def test_frames_of_a_finished_scan_leave_the_memory(tmp_path: Path) -> None:
-    (tmp_path / "booth.toml").write_text(_CONFIG)
-    config = load_config(tmp_path / "booth.toml")
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
-    writer = ScanWriter(config, DriftWatch(store), logging.getLogger())
+def test_frames_of_a_finished_scan_leave_the_memory(one_camera: BoothConfig) -> None:
+    store = CalibrationStore(one_camera.calibrate.folder, one_camera.calibration)
+    writer = ScanWriter(one_camera, DriftWatch(store), logging.getLogger())
     try:
         depth = np.zeros((480, 640), np.uint16)
         found = Frameset({"front-lower": LiveFrame(_HEADER, depth)}, 5.0, 0.0)
