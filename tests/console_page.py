@@ -5,25 +5,21 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 from live_console import PASSWORD, LiveConsole
 from playwright.sync_api import (
     Browser,
     BrowserContext,
-    Error,
     Locator,
     Page,
-    Playwright,
     expect,
     sync_playwright,
 )
 
 LONG_MS = 120_000
 """Patience with a machine that does much else; no test is about speed."""
-_PAUSES_S = (1.0, 5.0, 10.0, 20.0)
-"""Pauses between attempts to start chromium."""
 _SIZE = {"width": 1024, "height": 768}
 _ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -40,23 +36,13 @@ _MOVING = """async () => {
 }"""
 
 
-def _launched(playwright: Playwright, chromium: str) -> Browser:
-    """A running chromium; beside other tests it sometimes dies by itself (SIGTRAP) at its start,
-    more than once in a row."""
-    for pause_s in _PAUSES_S:
-        with suppress(Error):
-            return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
-        time.sleep(pause_s)
-    return playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
-
-
 @contextmanager
 def browser() -> Iterator[Browser]:
     """Debian's chromium without a display."""
     chromium = shutil.which("chromium")
     assert chromium, "chromium is missing; make test installs it where it may: apt install chromium"
     with sync_playwright() as playwright:
-        started = _launched(playwright, chromium)
+        started = playwright.chromium.launch(executable_path=chromium, args=_ARGUMENTS)
         yield started
         started.close()
 

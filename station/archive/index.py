@@ -17,6 +17,7 @@ from pathlib import Path
 
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
+from station.core.files import private_file
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -137,13 +138,13 @@ class ScanIndex:
             return self._connect()
 
     def _connect(self, *, shared: bool = False) -> sqlite3.Connection:
-        mask = os.umask(0o177)
         try:
-            database = sqlite3.connect(
-                self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=not shared
-            )
-        finally:
-            os.umask(mask)
+            private_file(self._path)
+        except OSError as error:
+            raise sqlite3.OperationalError(error.strerror) from None
+        database = sqlite3.connect(
+            self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=not shared
+        )
         try:
             database.execute("PRAGMA journal_mode = WAL")
             # The folders are what lasts: nobody waits for the disk for the sake of this cache.

@@ -18,6 +18,7 @@ from station.core.errors import BoothError, FormatError
 
 PRIVATE_FOLDER_MODE = 0o700
 """Body scans are personal data: only the service's user may read them."""
+PRIVATE_FILE_MODE = 0o600
 _LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
 MAX_JSON_BYTES = 16 << 20
 """A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
@@ -47,6 +48,20 @@ def private_folder(folder: Path) -> Path:
     return folder
 
 
+def open_private(path: str | Path, flags: int) -> int:
+    """Open a file, a new one for its owner alone: an opener for `open`.
+
+    Unlike a mask of the process, which every thread's files and folders would be made with.
+    """
+    return os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE_MODE)
+
+
+def private_file(path: Path) -> Path:
+    """Create an empty file that only its owner may read, if there is none."""
+    os.close(open_private(path, os.O_RDWR | os.O_CREAT))
+    return path
+
+
 @contextmanager
 def held(path: Path, busy: BoothError) -> Iterator[None]:
     """Hold a lock file exclusively; it is released when the block or the process ends.
@@ -55,7 +70,7 @@ def held(path: Path, busy: BoothError) -> Iterator[None]:
         BoothError: `busy`, if another process holds it.
     """
     private_folder(path.parent)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    descriptor = open_private(path, os.O_RDWR | os.O_CREAT)
     try:
         for left in reversed(range(_LOCK_TRIES)):
             try:
@@ -137,14 +152,15 @@ def read_bounded_json(path: Path, most_bytes: int) -> Any:
         raise ValueError("is nested too deeply") from None
 
 
-def write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None:
+def write_bytes(path: Path, data: bytes, *, durable: bool = True, private: bool = False) -> None:
     """Write a file so that a reader, or a crash, sees the old content or the new, never a part.
 
-    Without ``durable`` it survives the end of the process, but not always a loss of power.
+    Without ``durable`` it survives the end of the process, but not always a loss of power. What
+    is ``private`` only its owner may read.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with temporary.open("wb") as stream:
+        with open(temporary, "wb", opener=open_private if private else None) as stream:
             stream.write(data)
             stream.flush()
             if durable:

@@ -17,7 +17,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from station.core.errors import SpoolError
-from station.core.files import entries_of, fsync_folder, private_folder, publish_folder, write_json
+from station.core.files import (
+    entries_of,
+    fsync_folder,
+    open_private,
+    private_folder,
+    publish_folder,
+    write_json,
+)
 from station.core.scans import REASON, ScanFolders, ScanId, ScanNote, Stage, boot_id, is_scan_id
 
 MAX_DEATHS = 10
@@ -175,9 +182,8 @@ class Spool(ScanFolders):
     def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""
         path = self.folder / "locks" / f"{scan_id}.lock"
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
         while True:
-            descriptor = os.open(path, flags, 0o600)
+            descriptor = open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Its previous holder removes the file: a lock on a removed file locks nothing.

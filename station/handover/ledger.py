@@ -7,14 +7,13 @@ handover/<target>/done/<scan id>           handed over; kept as long as the resu
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from station.core.files import fsync_folder, private_folder, write_json
+from station.core.files import fsync_folder, private_file, private_folder, write_json
 
 PAUSES_S = (5.0, 15.0, 60.0, 300.0, 900.0, 3600.0)
 """Pauses after the first, second ... failure; then every hour, without limit."""
@@ -71,7 +70,7 @@ class Ledger:
     def finish(self, entry: Waiting) -> None:
         """Mark a result as handed over."""
         done = self._place(entry.target, "done")
-        os.close(os.open(done / entry.scan_id, os.O_CREAT | os.O_WRONLY, 0o600))
+        private_file(done / entry.scan_id)
         fsync_folder(done)
         waiting = self._place(entry.target, "waiting")
         (waiting / f"{entry.scan_id}.json").unlink(missing_ok=True)

@@ -11,10 +11,11 @@ from pathlib import Path
 import zmq
 
 from station.core.errors import BoothError
-from station.core.files import is_held, private_folder
+from station.core.files import PRIVATE_FILE_MODE, is_held, private_folder
 from station.messaging.messages import Reply, Request
 from station.messaging.topics import TOPICS
 
+_SCHEME = "ipc://"
 _LONGEST_PATH = 100
 """The kernel allows 107 bytes for a socket's path."""
 MAX_MESSAGE_BYTES = 16 << 20
@@ -40,7 +41,7 @@ def endpoint(runtime_folder: Path, name: str) -> str:
     private_folder(folder)
     if folder.stat().st_uid != os.getuid():
         raise BoothError(f"{folder} belongs to another user; set runtime.folder in booth.toml")
-    return f"ipc://{folder / name}.ipc"
+    return f"{_SCHEME}{folder / name}.ipc"
 
 
 def _socket(context: zmq.Context[zmq.Socket[bytes]], kind: int, hwm: int) -> zmq.Socket[bytes]:
@@ -81,11 +82,8 @@ def _bound(
 ) -> zmq.Socket[bytes]:
     socket = _socket(context, kind, hwm)
     address = endpoint(runtime_folder, name)
-    mask = os.umask(0o177)
-    try:
-        socket.bind(address)
-    finally:
-        os.umask(mask)
+    socket.bind(address)
+    Path(address.removeprefix(_SCHEME)).chmod(PRIVATE_FILE_MODE)
     return socket
 
 

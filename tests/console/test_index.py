@@ -146,6 +146,10 @@ def test_many_readers_at_once(spool: Spool) -> None:
     for thread in threads:
         thread.join()
     assert wrong == []
+    # The mask of new files belongs to all threads: nobody enters a folder made under another one.
+    later = spool.folder / "later"
+    later.mkdir()
+    assert later.stat().st_mode & 0o700 == 0o700
 
 
 def _booth(spool: Spool) -> list[str]:

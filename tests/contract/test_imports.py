@@ -126,6 +126,11 @@ def test_every_package_says_what_belongs_there(path: Path) -> None:
         assert len((ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()) >= 1
 
 
+def test_nothing_changes_the_mask_of_new_files() -> None:
+    # It belongs to every thread of a process, and two that set and restore it leave the wrong one.
+    assert [path for path in _sources("station", "workers") if "umask(" in path.read_text()] == []
+
+
 def test_mathematics_opens_no_sockets() -> None:
     pure = [ROOT / name for name in PURE]
     pure += _sources(*PURE_FOLDERS)

@@ -6,9 +6,12 @@ import time
 from pathlib import Path
 
 import pytest
+import zmq
 
+from station.console.security.audit import AuditLog
 from station.core import files
 from station.core.errors import BundleError, FormatError
+from station.messaging.transport import server
 
 
 def test_json_round_trip(tmp_path: Path) -> None:
@@ -45,6 +48,19 @@ def test_unreadable_documents_are_named(tmp_path: Path, content: str | None, wor
     assert words in str(raised.value)
     assert str(path) in str(raised.value)
     assert issubclass(BundleError, FormatError)
+
+
+def test_private_files_are_private_whatever_the_mask(tmp_path: Path) -> None:
+    mask = os.umask(0)
+    try:
+        files.private_file(tmp_path / "a")
+        files.write_bytes(tmp_path / "b", b"secret", private=True)
+        AuditLog(tmp_path / "c").close()
+        with zmq.Context() as context, server(context, tmp_path / "d", "booth"):
+            modes = [path.stat().st_mode & 0o077 for path in tmp_path.rglob("*")]
+    finally:
+        os.umask(mask)
+    assert modes == [0] * 6
 
 
 def test_publish_never_overwrites(tmp_path: Path) -> None:

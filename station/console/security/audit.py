@@ -8,15 +8,22 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
-from station.core.files import private_folder
+from station.core.files import open_private, private_folder
 
 FILE = "audit.log"
 _BYTES, _FILES = 5_000_000, 10
+
+
+class _PrivateFiles(RotatingFileHandler):
+    """A log whose files, the next ones too, only their owner may read."""
+
+    def _open(self) -> TextIOWrapper:
+        return open(self.baseFilename, self.mode, encoding=self.encoding, opener=open_private)
 
 
 class AuditLog:
@@ -24,13 +31,9 @@ class AuditLog:
 
     def __init__(self, folder: Path) -> None:
         private_folder(folder)
-        mask = os.umask(0o177)
-        try:
-            self._handler = RotatingFileHandler(
-                folder / FILE, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
-            )
-        finally:
-            os.umask(mask)
+        self._handler = _PrivateFiles(
+            folder / FILE, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
+        )
 
     def note(self, who: str, address: str, what: str, scan_id: str = "") -> None:
         """One line."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import socket
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -43,19 +42,14 @@ def make_certificate(folder: Path, names: Sequence[str]) -> Path:
         .sign(key, hashes.SHA256())
     )
     private_folder(folder)
-    mask = os.umask(0o177)
-    try:
-        write_bytes(
-            folder / KEY,
-            key.private_bytes(
-                serialization.Encoding.PEM,
-                serialization.PrivateFormat.PKCS8,
-                serialization.NoEncryption(),
-            ),
-        )
-        write_bytes(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
-    finally:
-        os.umask(mask)
+    secret = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    for name, content in ((KEY, secret), (CERTIFICATE, public)):
+        write_bytes(folder / name, content, private=True)
     return folder / CERTIFICATE
 
 

@@ -8,7 +8,6 @@ person's, so it is hashed with argon2id (RFC 9106) in a file of its own.
 from __future__ import annotations
 
 import hashlib
-import os
 import secrets
 import sqlite3
 import threading
@@ -23,7 +22,7 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from station.core.errors import BoothError
-from station.core.files import private_folder, write_bytes
+from station.core.files import private_file, private_folder, write_bytes
 
 Scope = Literal["read", "scan", "manage"]
 SCOPES: tuple[Scope, ...] = ("read", "scan", "manage")
@@ -60,13 +59,12 @@ class Vault:
         self._folder = private_folder(folder)
         self._hasher = PasswordHasher()
         self._lock = threading.Lock()
-        mask = os.umask(0o177)
-        try:
-            self._database = sqlite3.connect(
-                folder / "console.sqlite", timeout=10, isolation_level=None, check_same_thread=False
-            )
-        finally:
-            os.umask(mask)
+        self._database = sqlite3.connect(
+            private_file(folder / "console.sqlite"),
+            timeout=10,
+            isolation_level=None,
+            check_same_thread=False,
+        )
         self._database.execute("PRAGMA journal_mode = WAL")
         self._database.executescript(_SCHEMA)
 
@@ -89,8 +87,8 @@ class Vault:
         """
         if len(password) < SHORTEST_PASSWORD:
             raise BoothError(f"the password needs {SHORTEST_PASSWORD} characters or more")
-        write_bytes(self._folder / PASSWORD, self._hasher.hash(_composed(password)).encode())
-        (self._folder / PASSWORD).chmod(0o600)
+        stored = self._hasher.hash(_composed(password)).encode()
+        write_bytes(self._folder / PASSWORD, stored, private=True)
         self._run("DELETE FROM sessions")
 
     def check_password(self, password: str) -> bool:
