@@ -8,6 +8,7 @@ images (--images).
 from __future__ import annotations
 
 import argparse
+import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -69,6 +70,8 @@ class Verdict:
     chi2: float = 0.0
     beyond_twice: bool = False
     """Accepted, with an error of more than twice a bar."""
+    seconds: float = 0.0
+    """Processor time of the solution."""
 
 
 def judge(name: str, seed: int, images: bool) -> Verdict:
@@ -121,7 +124,7 @@ def judge(name: str, seed: int, images: bool) -> Verdict:
         middle_mm / (1e3 * predicted.girth_sigma_m),
         found.tilt_deg / tilt_sigma_deg,
     )
-    return Verdict(words, ratios, float(chi2), beyond_twice)
+    return Verdict(words, ratios, float(chi2), beyond_twice, seconds)
 
 
 def summary(verdicts: Sequence[Verdict]) -> None:
@@ -133,16 +136,27 @@ def summary(verdicts: Sequence[Verdict]) -> None:
     beyond = sum(one.beyond_twice for one in accepted)
     hold = 100.0 * np.mean(ratios[:, :2] < 1.96, axis=0)
     chi2 = np.array([one.chi2 for one in accepted])
+    chi2 = np.array([one.chi2 for one in accepted])
+    # Includes the simulation.
+    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f"\n{len(accepted)} of {len(verdicts)} booths accepted")
-    print(f"  beyond twice a bar {beyond}  <= 0  {'met' if beyond == 0 else 'MISSED'}")
+    _bar("booths beyond twice a bar", beyond, beyond == 0, "0")
     for what, share in zip(("heights", "girths"), hold, strict=True):
-        verdict = "met" if share >= 93.0 else "MISSED"
-        print(f"  {what} within their stated 95 %: {share:.0f} %  >= 93  {verdict}")
+        _bar(f"{what} within their stated 95 % (%)", share, share >= 93.0, ">= 93")
+    _bar("chi2 a number, mean", chi2.mean(), 0.5 <= chi2.mean() <= 3.0, "0.5 to 3")
+    _bar("chi2 a number, worst", chi2.max(), chi2.max() <= 3.0, "<= 3")
+    slowest_s = max(one.seconds for one in accepted)
+    _bar("solving, worst (s of one core)", slowest_s, slowest_s <= 20.0, "<= 20")
+    _bar("memory, simulation included (MB)", memory_mb, memory_mb <= 1024.0, "<= 1024")
     print(
         f"  errors over stated sigmas, rms and worst: height {_rms(ratios[:, 0])}, "
-        f"girth {_rms(ratios[:, 1])}, tilt {_rms(ratios[:, 2])}; "
-        f"chi2 a number {chi2.mean():.2f} ({chi2.min():.2f} to {chi2.max():.2f})"
+        f"girth {_rms(ratios[:, 1])}, tilt {_rms(ratios[:, 2])}; chi2 a number from "
+        f"{chi2.min():.2f}, below 0.5 in {np.sum(chi2 < 0.5)}"
     )
+
+
+def _bar(what: str, value: float, met: bool, limit: str) -> None:
+    print(f"  {what:<40}{value:>8.2f}  {limit:<9}{'met' if met else 'MISSED'}")
 
 
 def _rms(ratios: NDArray[np.float64]) -> str:

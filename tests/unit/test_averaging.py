@@ -17,15 +17,17 @@ from station.simulation.scene import default_rig
 CAMERAS = default_rig().cameras
 NAMES = tuple(CAMERAS)
 GAIN = 1
-"""Place of the gain among a sensor's parameters."""
+CENTER, K1 = 7, 9
+"""Places of gain, centre (across) and k1 among a sensor's parameters."""
 
 
 def problem() -> Problem:
     return Problem(CAMERAS, NAMES[0], 0.1, {}, {}, (), Widths.widest(CAMERAS))
 
 
-def state(gains: Mapping[str, float], sigma: float) -> State:
-    """A state at nominal sensors, where data say that gains are these, each with a deviation."""
+def state(values: Mapping[str, float], sigma: float, place: int = GAIN) -> State:
+    """A state at nominal sensors, where data say that gains (or the parameters at another place)
+    are these, each with a deviation."""
     whole = problem()
     layout = Layout.of(whole)
     nothing = State(
@@ -45,10 +47,10 @@ def state(gains: Mapping[str, float], sigma: float) -> State:
     information[np.ix_(layout.bow, layout.bow)] = 0.0
     for prior in priors(whole, layout, nothing):
         information[np.ix_(prior.index, prior.index)] += prior.information
-    for name, gain in gains.items():
-        at = layout.sensor(name)[GAIN]
+    for name, value in values.items():
+        at = layout.sensor(name)[place]
         information[at, at] += sigma**-2.0
-        gradient[at] -= gain / sigma**2
+        gradient[at] -= value / sigma**2
     return replace(nothing, information=information, gradient=gradient)
 
 
@@ -93,3 +95,17 @@ def test_a_moderate_departure_gets_a_moderate_width() -> None:
     """0.12 % is four times a sound unit's, and a third of the worst."""
     found = most_probable_widths(problem(), state(dict.fromkeys(CAMERAS, 1.2e-3), 1e-4))
     assert {levels[0] for levels in found.sensors.values()} <= {1, 2}
+
+
+def test_a_lens_of_wrong_distortion_has_a_doubtful_centre() -> None:
+    """Nobody measured such a unit's lens."""
+    sigmas = []
+    for distortion in (0.0, 0.03):
+        at = state(dict.fromkeys(CAMERAS, distortion), 1e-3, K1)
+        for name in CAMERAS:
+            place = Layout.of(problem()).sensor(name)[CENTER]
+            at.information[place, place] += 1.0
+        solved = averaged_state(problem(), at)
+        sigmas.append(float(np.sqrt(solved.covariance[place, place])))
+    assert sigmas[0] < 0.5
+    assert sigmas[1] > 1.15 * sigmas[0]

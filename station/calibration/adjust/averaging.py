@@ -31,12 +31,14 @@ from station.calibration.adjust.widths import (
     BOW_TOLERANCE,
     CLASSES,
     FIELD_LEVELS,
+    LENS,
     LEVELS,
     RADIUS,
     SENSOR,
     SHAPE_LEVELS,
     Option,
     Widths,
+    lens_log_prior,
     sigma,
     width_options,
 )
@@ -184,6 +186,7 @@ class _SmoothChoice:
             for name, own in zip(CLASSES, self._options, strict=True)
         ]
         self._priors = [np.array([option.log_prior for option in own]) for own in self._options]
+        self._lens_prior = lens_log_prior(len(base.cameras))
         self._log: dict[Choice, float] = {}
         self.best = self._search(start)
 
@@ -284,7 +287,7 @@ class _SmoothChoice:
         log = 0.5 * np.sum(half**2, axis=1) - 0.5 * np.sum(precision * self._values**2, axis=1)
         log -= np.log(diagonal).sum(axis=1)
         log += 0.5 * np.log(precision).sum(axis=1) + self._constant
-        log += np.stack(
-            [own[k] for own, k in zip(self._priors, np.array(choices).T, strict=True)]
-        ).sum(axis=0)
+        columns = np.array(choices).T
+        log += sum(own[k] for own, k in zip(self._priors, columns, strict=True))
+        log += self._lens_prior[tuple(columns[CLASSES.index(name)] for name in LENS)]
         self._log.update(zip(choices, log.tolist(), strict=True))

@@ -21,6 +21,8 @@ SENSOR = (GAIN, FOCAL, CENTER, K1, FLATTENING)
 """Classes that each camera has a width of, in the order of the sensor's parameters."""
 RADIUS, BOW = "radius", "bow"
 CLASSES = (*SENSOR, RADIUS, BOW)
+LENS = (FOCAL, CENTER, K1)
+"""Classes whose widths have a prior in common, see `lens_log_prior`."""
 LEVELS = 4
 _ENDS: Mapping[str, tuple[float, float]] = {
     GAIN: (3e-4, 4e-3),
@@ -50,6 +52,14 @@ _SOUND = 0.6
 """Probability that a class is as in sound units, before anything is seen."""
 _ALONE = 0.1
 """Probability that it is wrong in one camera alone."""
+_OWN_LENS = 0.4
+"""Probability that what a driver says of its lens was measured on this unit, and not on its type:
+where the distortion proves wrong, nobody measured focal length and centre either."""
+_MEASURED = (0.5, 0.3, 0.15, 0.05)
+"""Probabilities of the levels of each lens parameter that was measured on the unit, ..."""
+_NOMINAL = {FOCAL: (0.05, 0.25, 0.35, 0.35), CENTER: (0.05, 0.25, 0.35, 0.35),
+            K1: (0.5, 0.15, 0.15, 0.2)}  # fmt: skip
+"""... and of those of a type: many of them hardly distort."""
 
 
 def sigma(name: str, level: int) -> float:
@@ -100,9 +110,11 @@ class Option:
 def width_options(name: str, cameras: int) -> tuple[Option, ...]:
     """All options of a class: one level for all cameras, or the widest level for one camera only.
 
-    The first is the narrowest, the ``LEVELS``-th the widest in all cameras.
+    The first is the narrowest, the ``LEVELS``-th the widest in all cameras. A lens's options say
+    nothing of their levels, which `lens_log_prior` does.
     """
-    shares = (_SOUND, *([(1.0 - _SOUND) / (LEVELS - 1)] * (LEVELS - 1)))
+    sound = (_SOUND, *([(1.0 - _SOUND) / (LEVELS - 1)] * (LEVELS - 1)))
+    shares = (1.0,) * LEVELS if name in LENS else sound
     if name in (RADIUS, BOW):
         return tuple(Option((level,), float(np.log(share))) for level, share in enumerate(shares))
     shared = [
@@ -117,3 +129,12 @@ def width_options(name: str, cameras: int) -> tuple[Option, ...]:
         for camera in range(cameras if cameras > 1 else 0)
     ]
     return (*shared, *alone)
+
+
+def lens_log_prior(cameras: int) -> Array:
+    """Log-probability (n, n, n) of the levels of the options of each class of ``LENS``."""
+    places = [[max(option.levels) for option in width_options(name, cameras)] for name in LENS]
+    measured = [np.array(_MEASURED)[at] for at in places]
+    nominal = [np.array(_NOMINAL[name])[at] for name, at in zip(LENS, places, strict=True)]
+    both = [np.einsum("i,j,k->ijk", *shares) for shares in (measured, nominal)]
+    return np.asarray(np.log(_OWN_LENS * both[0] + (1.0 - _OWN_LENS) * both[1]))
