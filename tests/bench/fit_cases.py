@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from room import first_with_room, has_room
 from unlike_bodies import UnlikeBodies
 from unlike_sensor import UnlikeSensor
 
@@ -21,7 +22,6 @@ from station.simulation.sensor import SimulatedBooth
 from workers.cloud.observed import PointCloud
 from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
 from workers.scape.model.body_model import BodyModel
-from workers.scape.surface.intersections import self_intersections
 
 Array = NDArray[np.float64]
 Group = Literal["family", "unlike", "other", "hard", "rig", "bad"]
@@ -29,8 +29,6 @@ Group = Literal["family", "unlike", "other", "hard", "rig", "bad"]
 _POOL = 30
 _SEED = 11
 _POSES_TO_CHOOSE_FROM = 300
-_TOUCHING = 40
-"""Crossings of triangles that armpits and toes have in any pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,12 @@ class TestBodies:
         self._poses = self._database.sample_poses("test", _POOL, _SEED)
 
     def body(self, index: int) -> Mesh:
-        return self._made(self._shapes.take(np.array([index])), self._poses[index])
+        """One body in the first pose, from its own on, that it has room for."""
+        shapes = self._shapes.take(np.array([index]))
+        poses = np.roll(self._poses, -index, axis=0)
+        posed = (self._database.vertices(shapes, pose[None])[0] for pose in poses)
+        faces = self._database.faces
+        return on_the_mark(first_with_room(self._database.vertices(shapes)[0], posed, faces), faces)
 
     @cached_property
     def arms_close(self) -> Mesh:
@@ -94,11 +97,9 @@ class TestBodies:
         return Mesh(body.vertices - forward[:, None] * (0.0, 1.0, 0.0), body.faces)
 
     def _has_room(self, index: int, pose: Array) -> bool:
-        """Whether no limb of a body is in its trunk in a pose."""
         shapes = self._shapes.take(np.array([index]))
         neutral, posed = self._database.vertices(shapes)[0], self._made(shapes, pose).vertices
-        faces = self._database.faces
-        return self_intersections(posed, faces) <= self_intersections(neutral, faces) + _TOUCHING
+        return has_room(neutral, posed, self._database.faces)
 
     @cached_property
     def _leanest_first(self) -> NDArray[np.intp]:

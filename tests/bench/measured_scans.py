@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from room import first_with_room
 from true_measurements import TrueBody
 from unlike_bodies import UnlikeBodies, UnlikeSplit
 from unlike_sensor import render_unlike
@@ -62,7 +63,11 @@ class Studio:
         poses = self._database.sample_poses(split, _POOL, _SEED[split])
         for index in range(min(count, _POOL)):
             name = f"{split}-{index:03d}"
-            yield self._scan(name, shapes.take(np.array([index])), poses[index], index)
+            one = shapes.take(np.array([index]))
+            posed = (self._posed(one, pose) for pose in np.roll(poses, -index, axis=0))
+            neutral = self._database.vertices(one)[0]
+            body = first_with_room(neutral, posed, self._database.faces)
+            yield self._scan(name, one, body, index)
 
     def unlike(self, split: UnlikeSplit, count: int) -> Iterator[Scan]:
         """The first so many sculpted bodies of a split, before sensors unlike the assumed ones."""
@@ -83,11 +88,13 @@ class Studio:
             rng = np.random.default_rng((index, 6))
             turned = base.copy()
             turned[moving] += np.radians(_REPEAT_TURN_DEG) * rng.standard_normal((moving.sum(), 3))
-            yield self._scan(f"anew-{index:02d}", shapes, turned, 5000 + index)
+            yield self._scan(f"anew-{index:02d}", shapes, self._posed(shapes, turned), 5000 + index)
 
-    def _scan(self, name: str, shapes: Shapes, pose: Array, seed: int) -> Scan:
+    def _posed(self, shapes: Shapes, pose: Array) -> Array:
+        return self._database.vertices(shapes, pose[None])[0]
+
+    def _scan(self, name: str, shapes: Shapes, body: Array, seed: int) -> Scan:
         rng = np.random.default_rng((seed, 77))
-        body = self._database.vertices(shapes, pose[None])[0]
         middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
         body = body - (*(middle[:2] + rng.uniform(-0.03, 0.03, 2)), 0.0)
         bundle = self._bundle(name, body)

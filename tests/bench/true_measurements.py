@@ -16,6 +16,7 @@ from station.core.geometry import so3_exp
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
     NARROWEST_TILTS_RAD,
+    NORMAL_RADIUS_M,
     PROTRUSION_SHARE,
     Definition,
     Drop,
@@ -26,6 +27,7 @@ from workers.measure.kinds import (
     Protrusion,
     Route,
     Section,
+    Thickest,
     Top,
 )
 from workers.scape.model.body_model import BodyModel
@@ -34,6 +36,7 @@ Array = NDArray[np.float64]
 
 _DIRECTIONS = 720
 _STEP_M = 2.5e-4
+_LEVEL_STEP_M = 2e-3
 _SAME_POINT_M = 1e-6
 _BELOW = 0.10
 
@@ -45,7 +48,6 @@ class TrueBody:
         self._v = vertices
         self._faces = model.faces
         self._at = {name: vertices[index] for name, index in model.landmarks.items()}
-        self._vertex_of = model.landmarks
         self._part = np.array(model.part_names)[model.part_of_vertex]
 
     def values(self) -> dict[str, float]:
@@ -73,11 +75,10 @@ class TrueBody:
         if isinstance(kind.plane, Narrowest):
             girths = [self._neck(kind.plane, kind.parts, tilt) for tilt in NARROWEST_TILTS_RAD]
             return min(girth for girth in girths if girth is not None)
+        if isinstance(kind.plane, Thickest):
+            return self._thickest(kind.plane, kind)
         point, normal = self._plane(kind.plane)
-        segments = self._segments(point, normal, kind.parts)
-        if not kind.whole:
-            segments = _nearest_chain(segments, point)
-        points = segments.reshape(-1, 3)
+        points = self._points(point, normal, kind)
         if kind.across is None:
             return _tape_around(points, normal)
         side, other = kind.across
@@ -87,6 +88,19 @@ class TrueBody:
         if row.quantity == "depth":
             across = np.cross(normal, across)
         return float(np.ptp(points @ across))
+
+    def _points(self, point: Array, normal: Array, kind: Section) -> Array:
+        segments = self._segments(point, normal, kind.parts)
+        if not kind.whole:
+            segments = _nearest_chain(segments, point)
+        return segments.reshape(-1, 3)
+
+    def _thickest(self, plane: Thickest, kind: Section) -> float:
+        """Every 2 mm, the greatest of all."""
+        (low, _), (high, up) = self._plane(plane.lower), self._plane(plane.upper)
+        count = int(np.ceil(np.linalg.norm(high - low) / _LEVEL_STEP_M))
+        levels = (low + share * (high - low) for share in np.linspace(0.0, 1.0, count + 1))
+        return max(_tape_around(self._points(level, up, kind), up) for level in levels)
 
     def _neck(self, plane: Narrowest, parts: tuple[str, ...], tilt: float) -> float | None:
         at = self._at
@@ -166,7 +180,11 @@ class TrueBody:
 
     def _over(self, kind: Route, start: str, end: str, taut: bool) -> float:
         a, b = self._at[start], self._at[end]
-        outward = self._normal(start) + self._normal(end)
+        if kind.closed:
+            middle = sum(self._at[name] for name in kind.landmarks) / len(kind.landmarks)
+            outward = (a + b) / 2.0 - middle
+        else:
+            outward = self._normal(start, kind.parts) + self._normal(end, kind.parts)
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
         up = outward - along * (along @ outward)
@@ -195,11 +213,13 @@ class TrueBody:
         reach = np.outer(line[:, 0], np.cos(angle)) + np.outer(line[:, 1], np.sin(angle))
         return float(np.pi * np.ptp(reach, axis=0).mean()) - length
 
-    def _normal(self, landmark: str) -> Array:
-        """Area-weighted, of the triangles around a landmark."""
-        around = self._faces[(self._faces == self._vertex_of[landmark]).any(axis=1)]
-        a, b, c = (self._v[around[:, i]] for i in range(3))
-        total = np.cross(b - a, c - a).sum(axis=0)
+    def _normal(self, landmark: str, parts: tuple[str, ...]) -> Array:
+        """Mean normal of the triangles around a landmark, by area and nearness."""
+        mine = np.isin(self._part, parts)[self._faces].all(axis=1)
+        a, b, c = (self._v[self._faces[mine][:, i]] for i in range(3))
+        away = np.linalg.norm((a + b + c) / 3.0 - self._at[landmark], axis=1) / NORMAL_RADIUS_M
+        nearness = np.where(away < 1.0, 1.0 - away**2, 0.0)
+        total = (nearness[:, None] * np.cross(b - a, c - a)).sum(axis=0)
         return np.asarray(total / np.sqrt(total @ total))
 
 

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from room import first_with_room
 from sculpting import Body, sculpted
 from true_measurements import TrueBody
 
@@ -24,7 +25,6 @@ from workers.measure.standing import on_both_feet, standard_turns
 from workers.scape.learn.database import PARTS, Shapes, body_database
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, vertex_normals
-from workers.scape.surface.intersections import self_intersections
 
 Array = NDArray[np.float64]
 UnlikeSplit = Literal["development", "test"]
@@ -94,15 +94,10 @@ class UnlikeBodies:
         return [self._subdivision @ body for body in self._database.vertices(one, np.stack(poses))]
 
     def _with_room(self, shapes: Shapes, neutral: Array, moved: Array, index: int) -> Array:
-        """The sculpted body in the first pose, from its own on, in which no limb is in its trunk or
-        in another limb: no person stands like that."""
-        most = self_intersections(neutral + moved, self.faces) + _TOUCHING
-        for pose in np.roll(self._poses, -index, axis=0):
-            posed = self._finer(shapes, pose)[0]
-            posed = posed + carried(moved, neutral, posed, self.faces)
-            if self_intersections(posed, self.faces) <= most:
-                return posed
-        raise RuntimeError("every pose has a limb in the body")
+        """The sculpted body in the first pose, from its own on, that it has room for."""
+        poses = (self._finer(shapes, pose)[0] for pose in np.roll(self._poses, -index, axis=0))
+        moved_poses = (posed + carried(moved, neutral, posed, self.faces) for posed in poses)
+        return first_with_room(neutral + moved, moved_poses, self.faces, _TOUCHING)
 
     def _sculpted(self, neutral: Array, index: int, *, female: bool) -> Array:
         landmarks = self._model.landmarks

@@ -95,8 +95,8 @@ def _trunk_girths() -> tuple[Definition, ...]:
             Section(Level(_BUST), TRUNK, whole=True), f"{CLOTHES} 5.3.4",
         ),
         Definition(
-            "high_bust_girth", "level, below the armpits and above the bust", "large girth",
-            Section(Level(_ARMPITS, _BUST, 0.3), TRUNK, whole=True), f"{CLOTHES} 5.3.6",
+            "high_bust_girth", "level, midway from the armpits to the bust points", "large girth",
+            Section(Level(_ARMPITS, _BUST, 0.5), TRUNK, whole=True), f"{CLOTHES} 5.3.6",
         ),
         Definition(
             "underbust_girth", "level, in the fold below the bust", "large girth",

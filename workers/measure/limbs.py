@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from workers.measure.kinds import Definition, Drop, Level, Perpendicular, Route, Section
+from workers.measure.kinds import Definition, Drop, Level, Perpendicular, Route, Section, Thickest
 from workers.measure.vocabulary import (
     BODY,
     CLOTHES,
@@ -136,8 +136,8 @@ def leg(side: str) -> tuple[Definition, ...]:
     shin = (f"shin_{side}", f"foot_{side}", f"thigh_{side}")
     return (
         Definition(
-            f"thigh_girth_{side}", "level, just below the crotch", "girth",
-            Section(Level(("crotch",), (knee,), 0.05), thigh), f"{CLOTHES} 5.3.20",
+            f"thigh_girth_{side}", "level, about 3 cm below the crotch", "girth",
+            Section(Level(("crotch",), (knee,), 0.08), thigh), f"{CLOTHES} 5.3.20",
         ),
         Definition(
             f"mid_thigh_girth_{side}", "level, midway from crotch to knee", "girth",
@@ -149,7 +149,10 @@ def leg(side: str) -> tuple[Definition, ...]:
         ),
         Definition(
             f"calf_girth_{side}", "level, at the calf's thickest", "girth",
-            Section(Level((f"calf_{side}",)), shin), f"{CLOTHES} 5.3.24",
+            Section(
+                Thickest(Level((knee,), (ankle,), 0.15), Level((knee,), (ankle,), 0.6)), shin
+            ),
+            f"{CLOTHES} 5.3.24",
         ),
         Definition(
             f"ankle_girth_{side}", "level, just above the ankle bone", "girth",

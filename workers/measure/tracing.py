@@ -13,7 +13,9 @@ from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
     NARROWEST_TILTS_RAD,
+    NORMAL_RADIUS_M,
     PROTRUSION_SHARE,
+    THICKEST_LEVELS,
     Definition,
     Drop,
     Level,
@@ -23,6 +25,7 @@ from workers.measure.kinds import (
     Protrusion,
     Route,
     Section,
+    Thickest,
     Tilted,
     Top,
 )
@@ -37,7 +40,6 @@ from workers.measure.sections import (
     surface_order,
 )
 from workers.scape.model.body_model import BodyModel
-from workers.scape.model.deformation import vertex_normals
 
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -79,10 +81,15 @@ def trace_all(
 
 
 @lru_cache(maxsize=64)
-def _net(model: BodyModel, parts: tuple[str, ...]) -> EdgeNet:
+def _triangles(model: BodyModel, parts: tuple[str, ...]) -> Index:
     wanted = [model.part_names.index(part) for part in parts]
     inside = np.isin(model.part_of_vertex, wanted)
-    return EdgeNet.build(model.faces[inside[model.faces].all(axis=1)])
+    return np.flatnonzero(inside[model.faces].all(axis=1))
+
+
+@lru_cache(maxsize=64)
+def _net(model: BodyModel, parts: tuple[str, ...]) -> EdgeNet:
+    return EdgeNet.build(model.faces[_triangles(model, parts)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +107,9 @@ class _Tracer:
     def __init__(self, model: BodyModel, vertices: Array) -> None:
         self._model = model
         self._vertices = vertices
-        self._normals = vertex_normals(vertices, model.faces)
+        corners = vertices[model.faces]
+        self._middles = corners.mean(axis=1)
+        self._crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._cuts: dict[Section, _Tape] = {}
 
     def trace(self, definition: Definition) -> Trace:
@@ -203,14 +212,30 @@ class _Tracer:
             raise ValueError("no section goes around it")
         return min(tapes, key=lambda tape: loop_length(tape.places, closed=True))
 
+    def _thickest(self, section: Section, plane: Thickest) -> _Tape:
+        low, high = self._plane(plane.lower)[0], self._plane(plane.upper)[0]
+        places = np.linspace(low, high, THICKEST_LEVELS)
+        tapes = [self._tape(section, place, _UP) for place in places]
+        girths = [loop_length(tape.places, closed=True) for tape in tapes]
+        most = int(np.argmax(girths))
+        if not 0 < most < THICKEST_LEVELS - 1:
+            return tapes[most]
+        below, here, above = girths[most - 1 : most + 2]
+        steps = 0.5 * (above - below) / max(2.0 * here - below - above, 1e-9)
+        place = places[most] + steps * (places[1] - places[0])
+        return self._tape(section, place, _UP)
+
     def _cut(self, section: Section) -> _Tape:
         """Tape around a section; kept for breadth and depth."""
         key = Section(section.plane, section.parts, section.whole)
         if key not in self._cuts:
-            if isinstance(section.plane, Narrowest):
-                self._cuts[key] = self._narrowest(section, section.plane)
-            else:
-                self._cuts[key] = self._tape(section, *self._plane(section.plane))
+            match section.plane:
+                case Narrowest() as plane:
+                    self._cuts[key] = self._narrowest(section, plane)
+                case Thickest() as plane:
+                    self._cuts[key] = self._thickest(section, plane)
+                case plane:
+                    self._cuts[key] = self._tape(section, *self._plane(plane))
         return self._cuts[key]
 
     def _tape(self, section: Section, point: Array, normal: Array) -> _Tape:
@@ -250,7 +275,10 @@ class _Tracer:
 
     def _over_skin(self, route: Route, start: int, end: int, *, taut: bool) -> EdgePoints:
         ends = self._vertices[start], self._vertices[end]
-        outward = self._normals[start] + self._normals[end]
+        if route.closed:
+            outward = 0.5 * (ends[0] + ends[1]) - self._mean(route.landmarks)
+        else:
+            outward = self._facing(route, ends[0]) + self._facing(route, ends[1])
         normal = np.cross(ends[1] - ends[0], outward)
         normal /= np.linalg.norm(normal)
         net = _net(self._model, route.parts)
@@ -264,3 +292,11 @@ class _Tracer:
             bulge=route.bulge,
         )
         return found.take(order)
+
+    def _facing(self, route: Route, end: Array) -> Array:
+        """Unit normal of the skin around an end of a leg."""
+        triangles = _triangles(self._model, route.parts)
+        away = self._middles[triangles] - end
+        weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away) / NORMAL_RADIUS_M**2)
+        total = weight @ self._crosses[triangles]
+        return np.asarray(total / np.linalg.norm(total))

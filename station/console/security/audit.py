@@ -23,7 +23,7 @@ class _PrivateFiles(RotatingFileHandler):
     """A log whose files, the next ones too, only their owner may read."""
 
     def _open(self) -> TextIOWrapper:
-        return open(self.baseFilename, self.mode, encoding=self.encoding, opener=open_private)
+        return open(self.baseFilename, "a", encoding=self.encoding, opener=open_private)
 
 
 class AuditLog:
