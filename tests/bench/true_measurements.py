@@ -16,8 +16,9 @@ from station.core.geometry import so3_exp
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
     NARROWEST_TILTS_RAD,
-    NORMAL_RADIUS_M,
+    NORMAL_RADIUS,
     PROTRUSION_SHARE,
+    TRUNK_ENDS,
     Definition,
     Drop,
     Level,
@@ -217,7 +218,9 @@ class TrueBody:
         """Mean normal of the triangles around a landmark, by area and nearness."""
         mine = np.isin(self._part, parts)[self._faces].all(axis=1)
         a, b, c = (self._v[self._faces[mine][:, i]] for i in range(3))
-        away = np.linalg.norm((a + b + c) / 3.0 - self._at[landmark], axis=1) / NORMAL_RADIUS_M
+        trunk = np.linalg.norm(np.subtract(*(self._at[end] for end in TRUNK_ENDS)))
+        away = np.linalg.norm((a + b + c) / 3.0 - self._at[landmark], axis=1)
+        away /= NORMAL_RADIUS * trunk
         nearness = np.where(away < 1.0, 1.0 - away**2, 0.0)
         total = (nearness[:, None] * np.cross(b - a, c - a)).sum(axis=0)
         return np.asarray(total / np.sqrt(total @ total))

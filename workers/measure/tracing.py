@@ -13,9 +13,10 @@ from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
     NARROWEST_TILTS_RAD,
-    NORMAL_RADIUS_M,
+    NORMAL_RADIUS,
     PROTRUSION_SHARE,
     THICKEST_LEVELS,
+    TRUNK_ENDS,
     Definition,
     Drop,
     Level,
@@ -296,7 +297,8 @@ class _Tracer:
     def _facing(self, route: Route, end: Array) -> Array:
         """Unit normal of the skin around an end of a leg."""
         triangles = _triangles(self._model, route.parts)
-        away = self._middles[triangles] - end
-        weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away) / NORMAL_RADIUS_M**2)
+        neck, crotch = (self._at(landmark) for landmark in TRUNK_ENDS)
+        away = (self._middles[triangles] - end) / (NORMAL_RADIUS * np.linalg.norm(neck - crotch))
+        weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away))
         total = weight @ self._crosses[triangles]
         return np.asarray(total / np.linalg.norm(total))
