@@ -21,10 +21,10 @@ the air; straight down to the floor, which ends the route.
 Skin and tape run in the plane of both ends and a direction outwards, on the side of that direction.
 It is the one from the middle of all landmarks to the middle of both ends where the route is closed;
 else the sum of both ends' normals, each the mean over the skin of the route's parts, with weights
-1 - (d / r)^2 at the distance d from the end, r being `NORMAL_RADIUS` of the trunk's length. Points of
-the section that are farther from the straight line than 0.1 of its length below it, or `Route.bulge`
-above it, belong to another part of the body. Where the skin folds back, the line follows its
-outside."""
+1 - (d / r)^2 at the distance d from the end, r being `NORMAL_RADIUS` of the trunk's length. Points
+of the section that are farther from the straight line than 0.1 of its length below it, or
+`Route.bulge` above it, belong to another part of the body. Where the skin folds back, the line
+follows its outside."""
 TRUNK_ENDS = ("cervicale", "crotch")
 NORMAL_RADIUS = 0.11
 """7 cm on an average trunk. Folds of an armpit turn the normals at a landmark itself by 90 degrees:
