@@ -99,14 +99,15 @@ class Spool(ScanFolders):
             SpoolError: it is not in failed/.
         """
         bundle = self.path("failed", scan_id)
+        absent = SpoolError(
+            f"scan {scan_id} is not among the failed scans in {bundle.parent}; see station list"
+        )
         lock = self.lock(scan_id)
-        if lock is None or not bundle.is_dir():
-            if lock is not None:
-                self.unlock(scan_id, lock)
-            raise SpoolError(
-                f"scan {scan_id} is not among the failed scans in {bundle.parent}; see station list"
-            )
+        if lock is None:
+            raise absent
         try:
+            if not bundle.is_dir():
+                raise absent
             fresh = ScanNote(scan_id, "accepted", label=self.note(scan_id).label)
             self.notes.write(fresh, durable=True)
             (bundle / REASON).unlink(missing_ok=True)
@@ -124,19 +125,25 @@ class Spool(ScanFolders):
         back = []
         for scan_id in self.scans_in("work"):
             try:
-                lock = self.lock(scan_id)
-                if lock is None:
-                    continue
-                claim = Claim(self, scan_id, lock, self.note(scan_id))
-                try:
-                    if self._settle(claim, retries):
-                        back.append(scan_id)
-                finally:
-                    claim.close()
+                if self._recover(scan_id, retries):
+                    back.append(scan_id)
             except OSError as error:
                 _LOG.warning("scan %s waits for the disk: %s", scan_id, error)
         self._remove_idle_locks()
         return back
+
+    def _recover(self, scan_id: ScanId, retries: int) -> bool:
+        lock = self.lock(scan_id)
+        if lock is None:
+            return False
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.unlock, scan_id, lock)
+            claim = Claim(self, scan_id, lock, self.note(scan_id))
+            undo.pop_all()
+        try:
+            return self._settle(claim, retries)
+        finally:
+            claim.close()
 
     def _remove_idle_locks(self) -> None:
         """Remove lock files that a refusing disk left behind: they bear the names of scans."""

@@ -252,6 +252,22 @@ def test_a_lock_file_that_could_not_be_removed_is_removed_later(
     spool.unlock(ScanId("b"), held)
 
 
+def test_a_note_that_cannot_be_read_leaves_the_scan_unlocked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that recovers lives on: a lock that it kept would hold the scan for as long."""
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    claim = spool.claim()
+    assert claim is not None
+    claim.release()
+    with monkeypatch.context() as broken:
+        broken.setattr(spool, "note", _refuse)
+        assert spool.recover(retries=2) == []
+    assert spool.recover(retries=2) == ["a"]
+    assert spool.waiting() == ["a"]
+
+
 def test_a_spool_in_two_file_systems_is_refused_before_a_scan(tmp_path: Path) -> None:
     elsewhere = Path("/dev/shm") / f"booth-test-{os.getpid()}"
     elsewhere.mkdir()
