@@ -11,6 +11,7 @@ import json
 import os
 import sqlite3
 import time
+import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -22,7 +23,7 @@ from station.core.spool import Spool
 
 FILE = "index.sqlite"
 _VERSION = 1
-_BUSY_S = 10.0
+_BUSY_S, _PAUSE_S = 10.0, 0.01
 _SETTLED_NS = 50_000_000
 """A folder that changed this recently may change again within the same tick of its clock."""
 _SCHEMA = """
@@ -139,14 +140,14 @@ class ScanIndex:
 
     def _connect(self, *, shared: bool = False) -> sqlite3.Connection:
         try:
-            private_file(self._path)
+            _create(self._path)
         except OSError as error:
             raise sqlite3.OperationalError(error.strerror) from None
         database = sqlite3.connect(
             self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=not shared
         )
         try:
-            database.execute("PRAGMA journal_mode = WAL")
+            _share(database)
             # The folders are what lasts: nobody waits for the disk for the sake of this cache.
             database.execute("PRAGMA synchronous = NORMAL")
             # Labels of purged scans must not stay behind in the file's free pages.
@@ -202,6 +203,35 @@ class ScanIndex:
                 json.dumps(record.reasons), json.dumps(dict(record.seconds)),
             ],
         )  # fmt: skip
+
+
+def _create(path: Path) -> None:
+    """Create an empty file that only its owner may read, if there is none.
+
+    One that is there is not opened: to close it would drop the locks that this process' other
+    connections have on it.
+    """
+    if path.exists():
+        return
+    beside = private_file(path.with_name(f".{path.name}.{uuid.uuid4().hex}"))
+    try:
+        with suppress(FileExistsError):
+            os.link(beside, path)
+    finally:
+        beside.unlink()
+
+
+def _share(database: sqlite3.Connection) -> None:
+    """Let readers and a writer be at work at once. For this change SQLite waits for nobody."""
+    deadline_s = time.monotonic() + _BUSY_S
+    while True:
+        try:
+            database.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError:
+            if time.monotonic() > deadline_s:
+                raise
+        time.sleep(_PAUSE_S)
 
 
 @contextmanager

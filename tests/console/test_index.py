@@ -1,6 +1,8 @@
 """Scans are found by label and time, from the folders alone."""
 
 import json
+import os
+import re
 import shutil
 import sqlite3
 import threading
@@ -129,6 +131,25 @@ def test_an_old_result_takes_its_label_from_its_bundle(spool: Spool) -> None:
     write_json(bundle / "bundle.json", {"label": "Order 5", "created": "2026-11-25T10:00:01Z"})
     found = _got(ScanIndex(spool), folder.name)
     assert (found.label, found.created) == ("Order 5", "2026-11-25T10:00:01Z")
+
+
+def test_a_look_at_the_index_drops_no_lock_of_its_process(spool: Spool) -> None:
+    """Whoever closes a file anywhere drops all locks that the process has on it."""
+    index = ScanIndex(spool)
+    index.hold()
+    index.find()
+    before = _locks(spool.folder / FILE)
+    index.find()
+    assert before
+    assert _locks(spool.folder / FILE) == before
+    index.release()
+
+
+def _locks(path: Path) -> list[str]:
+    """Lines of the kernel's list about this process' locks on a file."""
+    words = {str(os.getpid()), str(path.stat().st_ino)}
+    lines = Path("/proc/locks").read_text().splitlines()
+    return sorted(line.split(":", 1)[1] for line in lines if words <= set(re.split("[ :]", line)))
 
 
 def test_many_readers_at_once(spool: Spool) -> None:
