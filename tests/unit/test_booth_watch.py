@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -96,6 +97,18 @@ def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
     for word in ("go", "yes"):
         with pytest.raises(RefusedError, match="no answer"):
             tasks.answer(word)
+    tasks.answer("1.7")
+    _until(lambda: not tasks.state()["running"])
+    assert tasks.state()["lines"] == ["1.7"]
+
+
+def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
+    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    command = [sys.executable, "-c", _ASKS]
+    request = threading.Thread(target=lambda: tasks._begin("calibrate", "stand", command))
+    request.start()
+    request.join()
+    _until(lambda: bool(tasks.state()["waits_for"]))
     tasks.answer("1.7")
     _until(lambda: not tasks.state()["running"])
     assert tasks.state()["lines"] == ["1.7"]

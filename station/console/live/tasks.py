@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ _EXIT_MOVED = 3
 _ANSWERS = {"go": ("go",), "yes or no": ("yes", "no"), "height": ("no",)}
 """Kind of question -> the words that answer it; a height is answered by a number, too."""
 CHECK_FILE = "last-check.json"
+_Started = Future[subprocess.Popen[str]]
 
 
 class Tasks:
@@ -102,8 +104,17 @@ class Tasks:
         with self._lock:
             if self._process is not None:
                 raise RefusedError(f"{self._state['kind']} is in progress; wait for it, or stop it")
+            # The process ends with the thread that starts it, and a request's ends soon.
+            started = _Started()
+            threading.Thread(target=self._run, args=(command, started), daemon=True).start()
+            self._process = started.result()
             self._state = {**_idle(), "kind": kind, "step": step, "running": True}
-            self._process = subprocess.Popen(
+        self._tell()
+        return self.state()
+
+    def _run(self, command: list[str], started: _Started) -> None:
+        try:
+            process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -111,10 +122,11 @@ class Tasks:
                 text=True,
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )
-            reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
-        reader.start()
-        self._tell()
-        return self.state()
+        except OSError as error:
+            started.set_exception(error)
+            return
+        started.set_result(process)
+        self._read(process)
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
