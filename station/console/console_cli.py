@@ -11,7 +11,7 @@ from station.console.security.certificate import make_certificate
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.service import set_up_logs, stop_event
+from station.core.service import return_freed_memory, set_up_logs, stop_event
 
 
 @click.command()
@@ -38,6 +38,7 @@ def console(config_path: Path | None, set_password: bool, make_certificate: bool
     from station.console.api.console import Console
     from station.console.server import check_exposure, serve
 
+    return_freed_memory()
     log = set_up_logs("console")
     stop = stop_event()
     parts = Console(config, path.resolve(), log)

@@ -34,7 +34,13 @@ CACHE_VARIABLE = "BOOTH_CACHE"
 HEALTH = "health"
 _CODE = Path(__file__).parent
 _NUMBA_VARIABLE = "NUMBA_CACHE_DIR"
+# Looked up now: a process that was just forked from one with threads must not wait for the loader.
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_PRCTL = _LIBC.prctl
 _PR_SET_PDEATHSIG = 1
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
+_MMAP_BYTES = 1 << 17
+"""A depth frame is larger; what is smaller comes and goes without the kernel."""
 _BEAT_PERIOD_S = 0.5
 _HEALTH_PERIOD_S = 0.25
 _MAX_HEALTH_BYTES = 1 << 20
@@ -79,7 +85,19 @@ def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]
     lock = runtime_folder / f"{file_name(process)}.lock"
     busy = BoothError(f"a {process} process is already running here ({lock}); end it first")
     with held(lock, busy):
+        return_freed_memory()
         yield set_up_logs(process)
+
+
+def return_freed_memory() -> None:
+    """Let large blocks, as frames are, go back to the kernel as soon as they are freed.
+
+    glibc would keep them in heaps of each thread from the first one that is freed on: the memory
+    of a process that runs for months would be the most that its threads ever had between them.
+    """
+    with contextlib.suppress(AttributeError):  # another C library
+        _LIBC.mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES)
+        _LIBC.mallopt(_M_ARENA_MAX, 1)
 
 
 def is_read_by_journal(descriptor: int = 2) -> bool:
@@ -233,9 +251,11 @@ def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
 
 
 def die_with_parent(parent: int) -> None:
-    """Ask the kernel to end this process when its parent (a process id) ends (Linux)."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    """Ask the kernel to end this process when its parent (a process id) ends (Linux).
+
+    It ends with the thread that started it: start it from one that lives as long.
+    """
+    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         # It ended before the kernel was asked.
         os._exit(1)

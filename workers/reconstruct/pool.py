@@ -23,7 +23,7 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.files import private_folder, write_json
 from station.core.scans import ScanId
-from station.core.service import Heartbeat, set_up_logs, stop_event
+from station.core.service import Heartbeat, return_freed_memory, set_up_logs, stop_event
 from station.core.spool import MAX_DEATHS, Claim, Spool
 from workers.reconstruct.job_handle import JobProcess, Outcome
 
@@ -212,4 +212,5 @@ def work(config_path: Path | None) -> None:
       reconstruct work --config booth.toml
     """
     config = load_config(find_config(config_path))
+    return_freed_memory()
     serve(config, stop_event(), set_up_logs("workers"))
