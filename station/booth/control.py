@@ -18,10 +18,14 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections import OrderedDict
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +34,6 @@ import zmq
 
 from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
-from station.booth.retention import expire_old
 from station.booth.session import (
     CANCELLED,
     MAX_LABEL_LENGTH,
@@ -44,7 +47,7 @@ from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
 from station.core.scans import ScanId, ScanNote, boot_id, failure_reason, scan_id_of
-from station.core.service import Heartbeat, only_process, stop_event
+from station.core.service import Heartbeat, die_with_parent, only_process, stop_event
 from station.core.spool import Spool
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
@@ -60,8 +63,8 @@ _PROGRESS_KEPT = 100
 class ControlProcess:
     """Keeps the desired state of the sensors, and reports the state of each scan."""
 
-    def __init__(self, config: BoothConfig, log: logging.Logger) -> None:
-        self._config, self._log = config, log
+    def __init__(self, config: BoothConfig, config_path: Path, log: logging.Logger) -> None:
+        self._config, self._config_path, self._log = config, config_path, log
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._folder = config.runtime.folder
         self._requests = server(self._context, self._folder, "control")
@@ -75,6 +78,7 @@ class ControlProcess:
         self._streaming = self._remembered()
         self._wished_s = 0.0
         self._tidied_s = -_TIDY_PERIOD_S
+        self._purge: subprocess.Popen[bytes] | None = None
         self._unreadable = 0
         self._heart = Heartbeat(self._folder, "control")
 
@@ -98,6 +102,8 @@ class ControlProcess:
             if now_s - self._tidied_s > _TIDY_PERIOD_S:
                 self._tidied_s = now_s
                 self._tidy()
+            if self._purge is not None and self._purge.poll() is not None:
+                self._purge = None
             self._heart.beat()
             if self._heart.due:
                 self._heart.report(
@@ -118,10 +124,20 @@ class ControlProcess:
         self._wishes.send_multipart([b"desired", DesiredState(self._streaming).pack()])
 
     def _tidy(self) -> None:
+        """Remove what dead writers left, and begin to remove what is past its time.
+
+        That takes long where there is much of it: it is for a process of its own, while this one
+        answers.
+        """
         try:
             self._spool.sweep()
-            for folder in expire_old(self._spool, self._config.retention):
-                self._log.info("removed %s: its retention period has ended", folder)
+            if self._purge is None:
+                command = [sys.executable, "-m", "station.cli", "purge", "--old"]
+                self._purge = subprocess.Popen(
+                    [*command, "--config", str(self._config_path)],
+                    stdin=subprocess.DEVNULL,
+                    preexec_fn=partial(die_with_parent, os.getpid()),
+                )
         except OSError as error:
             self._log.warning("old scans could not be removed: %s", error)
 
@@ -291,7 +307,8 @@ def control(config_path: Path | None) -> None:
     Examples:
       station control --config booth.toml
     """
-    config = load_config(find_config(config_path))
+    path = find_config(config_path)
+    config = load_config(path)
     with only_process(config.runtime.folder, "control") as log:
         serve_metrics(config, log)
-        ControlProcess(config, log).run(stop_event())
+        ControlProcess(config, path.resolve(), log).run(stop_event())

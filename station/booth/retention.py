@@ -8,6 +8,7 @@ deletes later, never earlier.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -21,7 +22,7 @@ from station.archive.index import ScanIndex
 from station.core.commands import config_option
 from station.core.config import RetentionConfig, find_config, load_config
 from station.core.errors import SpoolError
-from station.core.files import held, read_bounded_json, write_json
+from station.core.files import held, read_bounded_json, write_bytes
 from station.core.scans import STATES, ScanId, boot_id, scan_id_of
 from station.core.spool import Spool
 
@@ -136,7 +137,10 @@ def _load(spool: Spool) -> Ages:
 
 def _save(spool: Spool, ages: Ages) -> None:
     kept = {n: s for n, s in ages.seen_s.items() if _exists(spool, n)}
-    write_json(spool.folder / FILE, asdict(replace(ages, seen_s=kept)))
+    last = None if ages.last is None else asdict(ages.last)
+    document = {"counted_s": ages.counted_s, "last": last, "seen_s": kept}
+    # In one piece: thousands of scans in lines of their own take megabytes for a moment.
+    write_bytes(spool.folder / FILE, json.dumps(document, allow_nan=False).encode())
 
 
 def _exists(spool: Spool, name: str) -> bool:

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -21,7 +22,7 @@ _ORDER = Request("scan", "a", "", 1e9)
 
 @pytest.fixture
 def control(one_camera: BoothConfig) -> Iterator[ControlProcess]:
-    process = ControlProcess(one_camera, logging.getLogger())
+    process = ControlProcess(one_camera, Path("booth.toml"), logging.getLogger())
     process._reply(Request("start"))
     yield process
     process._context.destroy(linger=0)

@@ -37,6 +37,8 @@ _BODY = Path(__file__).parents[3] / "station/simulation/bodies/ann.npz"
 _CAMERAS = ("front-lower", "front-upper", "back-lower", "back-upper")
 _ROLES = ("sync", "control", "work")
 """Words on the command lines of the processes that write."""
+_PURGE = "purge"
+"""That of the process that deletes what is past its time."""
 _SETTINGS = """
 [spool]
 min_free_mb = 50
@@ -65,13 +67,14 @@ class Booth:
         self.config = load_config(self.path)
         self.cameras = _CAMERAS
         self.disk = {role: Injection(folder / "faults", role) for role in _ROLES}
+        self.clocks = [*self.disk.values(), Injection(folder / "faults", _PURGE)]
         self.order_job(job)
         self.station = Station(
             self.path,
             {
                 "PYTHONPATH": str(INSIDE),
                 "BOOTH_JOB_ORDER": str(folder / "job"),
-                **environment(build(folder), folder / "faults", _ROLES),
+                **environment(build(folder), folder / "faults", (*_ROLES, _PURGE)),
             },
         )
         self.command("start")

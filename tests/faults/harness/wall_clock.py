@@ -15,8 +15,8 @@ from table import Row
 _DAY_S = 86_400
 _JUMPS = (40, -40, 0)
 """Days by which the wall clock is ahead, one after the other."""
-_TIDYING_S = 2.0
-"""Control looks for what is due as soon as it starts."""
+_TIDYING_S = 5.0
+"""A process that control starts when it starts looks for what is due."""
 
 
 def wall_clock_rows() -> list[Row]:
@@ -47,8 +47,8 @@ def _jump(booth: Booth, scans: Scans, days: int) -> int:
     taking = threading.Thread(target=scans.take)
     taking.start()
     time.sleep(0.3)
-    for disk in booth.disk.values():
-        disk.move_wall_clock(days * _DAY_S)
+    for clock in booth.clocks:
+        clock.move_wall_clock(days * _DAY_S)
     taking.join()
     [control] = booth.pids("control")
     os.kill(control, signal.SIGKILL)
