@@ -136,7 +136,8 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
             raise ValueError("is not a regular file")
         if status.st_size > most_bytes:
             raise ValueError(f"has {status.st_size} bytes, at most {most_bytes} are allowed")
-        return stream.read(most_bytes + 1)
+        # As much as it has, not as much as it may have: room for that would be made at once.
+        return stream.read(status.st_size)
 
 
 def read_bounded_json(path: Path, most_bytes: int) -> Any:
