@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import later_lives
 import lives
 from injection import ERRNOS, Action, Injection, build, environment
 from table import Row
@@ -61,6 +62,14 @@ def _lives(real: bool) -> list[Life]:
         Life(
             "calibration", lives.calibration, lives.first_calibration, lives.calibrated,
             lives.finished,
+        ),
+        Life(
+            "hand-over", later_lives.hand_over, later_lives.outbox_with_result,
+            later_lives.whole_if_handed, later_lives.handed_over,
+        ),
+        Life(
+            "scan that fails and is deleted", later_lives.fail_and_purge, lambda _: None,
+            later_lives.nothing_torn, later_lives.nothing_left,
         ),
     ]  # fmt: skip
     if real:

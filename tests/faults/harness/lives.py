@@ -18,50 +18,65 @@ from unittest import mock
 import numpy as np
 
 from station.calibration.detect.detections import EMPTY, FRONT, MARK, BallDetection
-from station.calibration.guide.session import Session
+from station.calibration.detect.scene import StaticView
+from station.calibration.guide.session import Lens, Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
 from station.core.errors import FormatError
 from station.core.rig import Rig
 from station.core.scans import ScanId, ScanNote
-from station.core.spool import Spool
+from station.core.spool import Claim, Spool
 from station.simulation.scene import default_rig
+from workers.reconstruct.pool import CAMERAS, keep_evidence
 
-_ID = ScanId("20260101T000000Z-0001")
-_CAMERAS = ("front-lower", "back-upper")
-_RETRIES = 2
+SCAN = ScanId("20260101T000000Z-0001")
+RETRIES = 2
 
 
 @lru_cache
 def _rig() -> Rig:
-    whole = default_rig()
-    return replace(whole, cameras={name: whole.cameras[name] for name in _CAMERAS})
+    return default_rig()
 
 
 def scan(folder: Path, write_result: Callable[[Path], None]) -> None:
-    """A scan's life: order, bundle, claim, result, delivery."""
+    """A scan's life: order, bundle, claim, evidence about the cameras, result, delivery."""
     spool = Spool(folder / "spool")
-    if spool.notes.read(_ID) is None and spool.where(_ID) is None:
-        spool.notes.write(ScanNote(_ID, "capturing"), durable=False)
-    if spool.where(_ID) is None and spool.note(_ID).stage == "capturing":
-        bundle = spool.temporary(_ID)
-        depth = np.full((480, 640), 2000, np.uint16)
-        write_bundle(
-            bundle, scan_id=_ID, created="2026-01-01T00:00:00Z", label="", depth_scale_m=1e-3,
-            rig=_rig(), spread_s_max=0.001,
-            frames={name: [CapturedFrame(depth, 7, 6e7, 5.0, 1)] for name in _CAMERAS},
-        )  # fmt: skip
-        spool.submit(bundle, _ID)
-    spool.recover(_RETRIES)
+    if spool.notes.read(SCAN) is None and spool.where(SCAN) is None:
+        spool.notes.write(ScanNote(SCAN, "armed"), durable=False)
+    if spool.where(SCAN) is None and spool.note(SCAN).stage in ("armed", "capturing"):
+        submit(spool)
+    spool.recover(RETRIES)
     while (claim := spool.claim()) is not None:
-        result = spool.temporary(_ID)
+        result = spool.temporary(SCAN)
         result.mkdir()
         try:
             write_result(result)
+            keep_evidence({"format": "booth-camera-evidence"}, spool.folder / CAMERAS)
             claim.deliver(result, "ok")
         except OSError:
             claim.release()
             raise
+
+
+def submit(spool: Spool) -> None:
+    """Take a scan of one frame of each camera, as sync does."""
+    spool.notes.write(ScanNote(SCAN, "capturing"), durable=False)
+    bundle = spool.temporary(SCAN)
+    depth = np.full((480, 640), 2000, np.uint16)
+    write_bundle(
+        bundle, scan_id=SCAN, created="2026-01-01T00:00:00Z", label="", depth_scale_m=1e-3,
+        rig=_rig(), spread_s_max=0.001,
+        frames={name: [CapturedFrame(depth, 7, 6e7, 5.0, 1)] for name in _rig().cameras},
+    )  # fmt: skip
+    spool.submit(bundle, SCAN)
+
+
+def deliver_small(claim: Claim) -> None:
+    """Deliver a result of two files."""
+    result = claim.spool.temporary(SCAN)
+    result.mkdir()
+    small_result(result)
+    claim.deliver(result, "ok")
 
 
 def small_result(folder: Path) -> None:
@@ -84,12 +99,12 @@ def real_result() -> Callable[[Path], None]:
 
     model = job.warm_up()
     with mock.patch.object(job, "write_result", keep):
-        job.reconstruct_cloud(job._mean_cloud(model), _ID, Path("unused"), model=model)
+        job.reconstruct_cloud(job._mean_cloud(model), SCAN, Path("unused"), model=model)
     model, fit, cloud, measured, standing, _, method, _ = kept[0]
 
     def write(folder: Path) -> None:
         write_result(
-            folder, model, fit, cloud, measured, standing, Origin(_ID), method, Stopwatch()
+            folder, model, fit, cloud, measured, standing, Origin(SCAN), method, Stopwatch()
         )
 
     return write
@@ -117,6 +132,11 @@ def _whole(result: Path) -> bool:
     return len(names) == 2 and all(text == "whole" * 50 for text in names.values())
 
 
+def whole_results(folder: Path) -> bool:
+    """Whether all results in the outbox are whole."""
+    return all(map(_whole, (folder / "spool/outbox").glob("*")))
+
+
 def kept_bundles(folder: Path) -> int:
     """Whole bundles under a final name; torn ones count 100."""
     count = 0
@@ -133,6 +153,8 @@ def kept_bundles(folder: Path) -> int:
 
 
 _RUNS = 3
+_AROUND = ("around-0", "around-1")
+_SEEN_BY = "front-lower"
 
 
 def calibration(folder: Path) -> None:
@@ -159,19 +181,28 @@ def _session(store: CalibrationStore) -> Session:
 
 def _see(session: Session) -> None:
     if not session.done(EMPTY):
-        session.record_empty({}, [])
+        session.record_empty(dict.fromkeys(_rig().cameras, _view()), [])
     while session.runs < _RUNS:
         session.begin_run()
         session.record_balls([_ball(float(index)) for index in range(5)])
-    for step in (MARK, FRONT):
-        if not session.done(step):
+    for step in (MARK, FRONT, *_AROUND):
+        if not (session.done(step) if step in (MARK, FRONT) else step in session.around):
             session.record_resting(step, [_ball(0.0)])
+    if not session.lenses:
+        camera = _rig().cameras[_SEEN_BY]
+        lens = Lens(camera.K.tolist(), camera.distortion.tolist())
+        session.record_lenses({_SEEN_BY: lens})
+
+
+def _view() -> StaticView:
+    image = np.ones((12, 16), np.float32)
+    return StaticView(image, image, 0.01 * image, 0.01 * image, 30)
 
 
 def _ball(time_s: float) -> BallDetection:
     covariance = np.eye(3) * 1e-6
     return BallDetection(
-        _CAMERAS[0], time_s, np.array([0.0, 0.0, 2.0]), covariance, 500, 0.1, 1e-3, np.ones((3, 4))
+        _SEEN_BY, time_s, np.array([0.0, 0.0, 2.0]), covariance, 500, 0.1, 1e-3, np.ones((3, 4))
     )
 
 
@@ -195,7 +226,15 @@ def finished(folder: Path) -> bool:
     if len(found) != 1 or not found[0].in_use:
         return False
     seen = Session.load(found[0].folder)
-    return seen.done(MARK) and seen.done(FRONT) and len(seen.balls) >= 5 and seen.runs >= _RUNS
+    views = all(seen.background(camera) for camera in seen.cameras)
+    around = views and set(_AROUND) <= seen.around.keys() and _SEEN_BY in seen.lenses
+    return (
+        around
+        and seen.done(MARK)
+        and seen.done(FRONT)
+        and len(seen.balls) >= 5
+        and seen.runs >= _RUNS
+    )
 
 
 def first_calibration(folder: Path) -> None:
