@@ -1,0 +1,175 @@
+"""Verdicts on good scans, which must not be taken again, and on bad ones, which must be named.
+
+    python tests/bench/bench_verdict.py               # 60 good and 60 bad scans
+    python tests/bench/bench_verdict.py --bodies 2    # 2 + 1 good, 3 bad
+
+Good scans are those of bench_measure: held-out bodies and, half as many, sculpted ones before
+sensors that err otherwise than the fit assumes. Each of the other bodies is scanned badly three
+times: in a pose twice as far from the mark's as any that the model was learned for, with a limb
+that gives no reading, and a step off the mark. A limb is lost where the mean distance of its
+vertices from their true places is more than 5 cm, and named where the verdict calls its part
+missing; its rows are then blank.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from measured_scans import Studio
+from numpy.typing import NDArray
+from room import first_with_room
+
+from station.core.bundle import read_bundle
+from station.core.errors import BoothError
+from station.simulation.scene import Mesh
+from station.simulation.sensor import SimulatedBooth, render_bundle
+from workers.cloud.preprocess import preprocess
+from workers.reconstruct.job import warm_up
+from workers.scape.fit.fit import fit_body
+from workers.scape.fit.verdict import Verdict
+from workers.scape.learn.database import BodyDatabase
+from workers.scape.model.body_model import HAND, BodyModel
+
+Array = NDArray[np.float64]
+
+_SEED = 41
+_FARTHER = 2.0
+_LOST_M = 0.05
+_STEPS_M = (0.3, 0.6)
+_DARK = (
+    ("forearm", "hand", "thumb", "fingers"), ("upper_arm", "forearm", "hand", "thumb", "fingers"),
+    ("shin", "foot"), ("thigh", "shin", "foot"), ("foot",),
+)  # fmt: skip
+"""Parts that give no reading, in turn on the left and on the right."""
+_LIMBS = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
+
+
+@dataclass(frozen=True, slots=True)
+class BadScan:
+    """A body in the database's topology, and the triangles that the cameras can read."""
+
+    name: str
+    body: Array
+    dark: NDArray[np.bool_] | None = None
+
+
+def bad_scans(model: BodyModel, database: BodyDatabase, count: int) -> Iterator[BadScan]:
+    """Three of each of the first so many bodies."""
+    shapes = database.sample("test", count, _SEED)
+    poses = database.sample_poses("test", 4 * count, _SEED)
+    names = np.array(model.part_names)[model.part_of_vertex]
+    for index in range(count):
+        one = shapes.take(np.array([index]))
+        neutral = database.vertices(one)[0]
+
+        def posed(factor: float, start: int) -> Array:
+            turned = factor * np.roll(poses, -start, axis=0)
+            bodies = (database.vertices(one, pose[None])[0] for pose in turned)  # noqa: B023
+            body = first_with_room(neutral, bodies, database.faces)  # noqa: B023
+            middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
+            return np.asarray(body - (middle[0], middle[1], body[:, 2].min()))
+
+        usual = posed(1.0, index)
+        yield BadScan(f"{index:02d} far pose", posed(_FARTHER, count + index))
+        side = ("left", "right")[index % 2]
+        parts = [f"{part}_{side}" for part in _DARK[index % len(_DARK)]]
+        silent = np.isin(names, parts)
+        dark = np.logical_and.reduce(silent[database.faces], axis=1)
+        yield BadScan(f"{index:02d} no {parts[0]}", usual, dark)
+        rng = np.random.default_rng((_SEED, index))
+        angle, step_m = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*_STEPS_M)
+        aside = step_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+        yield BadScan(f"{index:02d} {step_m:.2f} m off", usual + aside)
+
+
+def lost_limbs(model: BodyModel, found: Array, truth: Array) -> dict[str, float]:
+    """Limbs far from their true places, with the mean distance in metres."""
+    away = np.linalg.norm(found - truth, axis=1)
+    names = np.array(model.part_names)[model.part_of_vertex]
+    means = {
+        f"{limb}_{side}": float(away[names == f"{limb}_{side}"].mean())
+        for limb in _LIMBS
+        for side in ("left", "right")
+    }
+    return {name: mean for name, mean in means.items() if mean > _LOST_M}
+
+
+def is_named(verdict: Verdict, limb: str) -> bool:
+    """Whether a verdict of "rescan" calls a limb missing."""
+    stem, _, side = limb.rpartition("_")
+    wanted = {f"{part}_{side}" for part in (HAND if stem == "hand" else (stem,))}
+    return verdict.status == "rescan" and wanted <= verdict.missing_parts
+
+
+def false_rescans(studio: Studio, bodies: int) -> tuple[int, int]:
+    """Good scans, and those of them that the product asks to take again."""
+    scans, wrong = 0, 0
+    for good in (studio.population("test", bodies), studio.unlike("test", bodies // 2)):
+        for scan in good:
+            scans += 1
+            wrong += scan.fit.verdict.status != "ok"
+            print(f"  {scan.name} {'; '.join(scan.fit.verdict.reasons) or 'ok'}", flush=True)
+    return scans, wrong
+
+
+def unnamed_losses(model: BodyModel, bodies: int, folder: Path) -> tuple[int, int, int, int]:
+    """Bad scans, those with lost limbs, those with one that is not named, and rescans."""
+    database = BodyDatabase()
+    scans = losses = unnamed = rescans = 0
+    for scan in bad_scans(model, database, bodies):
+        bundle = folder / f"bad-{scan.name.replace(' ', '-')}"
+        if not bundle.exists():
+            mesh = Mesh(scan.body, database.faces, scan.dark)
+            render_bundle(mesh, bundle, SimulatedBooth(seed=900 + scans))
+        scans += 1
+        try:
+            fit = fit_body(model, preprocess(read_bundle(bundle)))
+        except BoothError as error:
+            rescans += 1
+            print(f"  {scan.name}: error: {error}", flush=True)
+            continue
+        lost = lost_limbs(model, fit.overlapping, scan.body)
+        quiet = [limb for limb in lost if not is_named(fit.verdict, limb)]
+        losses += bool(lost)
+        unnamed += bool(quiet)
+        rescans += fit.verdict.status == "rescan"
+        words = ", ".join(
+            f"{limb} {1e3 * lost[limb]:.0f} mm{' NOT NAMED' if limb in quiet else ''}"
+            for limb in lost
+        )
+        reasons = "; ".join(fit.verdict.reasons) or "ok"
+        print(f"  {scan.name}: {words or 'nothing lost'} | {reasons}", flush=True)
+    return scans, losses, unnamed, rescans
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--bodies", type=int, default=40, help="good ones; half as many bad ones")
+    parser.add_argument("--scans", type=Path, help="keep what is rendered here, and use it again")
+    arguments = parser.parse_args()
+    model = warm_up()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.scans or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        good, wrong = false_rescans(Studio(model, folder), arguments.bodies)
+        bad, losses, unnamed, rescans = unnamed_losses(model, (arguments.bodies + 1) // 2, folder)
+    print(f"\nfalse rescans: {wrong} of {good} good scans (bar 0): {_word(wrong)}")
+    print(
+        f"limbs lost in {losses} of {bad} bad scans, {rescans} of which are to be taken again; "
+        f"not named in {unnamed} (bar 0): {_word(unnamed)}"
+    )
+
+
+def _word(count: int) -> str:
+    return "MISSED" if count else "met"
+
+
+if __name__ == "__main__":
+    main()
