@@ -24,7 +24,7 @@ from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import held, private_folder
 from station.core.service import die_with_parent, file_name, stop_event
-from station.messaging.transport import STATION_LOCK, endpoint
+from station.messaging.transport import STATION_LOCK, socket_folder
 
 WATCHDOG_S = 10.0
 """As in the systemd units. A main loop's longest step is far below a second."""
@@ -66,11 +66,15 @@ def services(config: BoothConfig) -> list[Service]:
     return table
 
 
+def _socket_name(service: str) -> str:
+    return f"notify-{file_name(service)}"
+
+
 class _Watch:
     """Receives the progress messages of one process."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.path = str(folder / f"notify-{file_name(name)}")
+        self.path = str(folder / _socket_name(name))
         with contextlib.suppress(FileNotFoundError):
             os.unlink(self.path)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -200,6 +204,6 @@ def run(config_path: Path | None) -> None:
             click.echo(
                 f"{config.calibration} is missing: run station calibrate before the first scan"
             )
-        # Sockets are in a folder whose path is short enough for the kernel.
-        sockets = Path(endpoint(folder, "notify").removeprefix("ipc://")).parent
-        supervise(services(config), path.resolve(), sockets, stop_event())
+        table = services(config)
+        longest = max((_socket_name(service.name) for service in table), key=len)
+        supervise(table, path.resolve(), socket_folder(folder, longest), stop_event())

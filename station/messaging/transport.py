@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import time
 from pathlib import Path
 
@@ -18,6 +17,8 @@ from station.messaging.topics import TOPICS
 _SCHEME = "ipc://"
 _LONGEST_PATH = 100
 """The kernel allows 107 bytes for a socket's path."""
+_SHORT = Path("/tmp")
+"""The same for all: an operator's TMPDIR may be another than the station's."""
 MAX_MESSAGE_BYTES = 16 << 20
 STATION_LOCK = "station.lock"
 """Held by `station run` in the runtime folder."""
@@ -30,18 +31,25 @@ class NoAnswerError(BoothError):
 
 
 def endpoint(runtime_folder: Path, name: str) -> str:
-    """The ipc address of a named socket in the booth's runtime folder.
+    """The ipc address of a named socket in the booth's runtime folder."""
+    file = f"{name}.ipc"
+    return f"{_SCHEME}{socket_folder(runtime_folder, file) / file}"
 
-    A folder whose path is too long is replaced by a short private one derived from it.
+
+def socket_folder(runtime_folder: Path, longest: str) -> Path:
+    """Folder of the sockets' files.
+
+    A runtime folder whose path is too long for the longest file's name is replaced by a short
+    private one derived from it.
     """
     folder = runtime_folder
-    if len(str(folder / f"{name}.ipc").encode()) > _LONGEST_PATH:
+    if len(str(folder / longest).encode()) > _LONGEST_PATH:
         digest = hashlib.sha256(str(runtime_folder).encode()).hexdigest()[:12]
-        folder = Path(tempfile.gettempdir()) / f"booth-{os.getuid()}-{digest}"
+        folder = _SHORT / f"booth-{os.getuid()}-{digest}"
     private_folder(folder)
     if folder.stat().st_uid != os.getuid():
         raise BoothError(f"{folder} belongs to another user; set runtime.folder in booth.toml")
-    return f"{_SCHEME}{folder / name}.ipc"
+    return folder
 
 
 def _socket(context: zmq.Context[zmq.Socket[bytes]], kind: int, hwm: int) -> zmq.Socket[bytes]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import zmq
 
 from station.messaging.intake import FrameIntake
 from station.messaging.messages import CameraHealth, FrameHeader
-from station.messaging.transport import publisher
+from station.messaging.transport import publisher, socket_folder
 
 _HEADER = FrameHeader("a", "A1", 8, 6, 1e-3, 7, 6e7, 5.0, 5.0, 1, 0)
 _PIXELS = np.arange(48, dtype=np.uint16).tobytes()
@@ -69,3 +71,17 @@ def test_a_bad_message_is_counted_and_the_next_frame_taken(
     assert intake.unreadable == 1
     assert intake.last_problem
     assert taken[0].depth[5, 7] == 47
+
+
+@pytest.mark.parametrize("length", [60, 70, 80, 90, 100, 140])
+def test_sockets_fit_into_folders_with_paths_of_any_length(tmp_path: Path, length: int) -> None:
+    """The kernel takes 107 bytes; a folder that is good for one name must be so for all."""
+    runtime = tmp_path / ("x" * max(1, length - len(str(tmp_path)) - 1))
+    runtime.mkdir()
+    name = "notify-capture-" + "c" * 40
+    folder = socket_folder(runtime, name)
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+            bound.bind(str(folder / name))
+    finally:
+        shutil.rmtree(folder)
