@@ -20,6 +20,9 @@ from typing import Any, Literal
 from station.core.config import BoothConfig
 
 _LOOK_S = 0.2
+WARM_UP_S = 120.0
+"""Until a process can do a job. It compiles the reconstruction once, which takes most of a minute,
+or more on a busy machine."""
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
 Blame = Literal["scan", "job", "station", "disk", "nobody"]
@@ -72,10 +75,11 @@ class JobProcess:
         """Wait for the job's end; it is killed when it takes too long or the station stops.
 
         Args:
+            timeout_s: time for the job alone; before that the process may warm up.
             begun: called once, when the process is warm and does its job.
         """
         process = self._process
-        last = self._last_message(time.monotonic() + timeout_s, stop, begun)
+        last = self._last_message(timeout_s, stop, begun)
         if last is None:
             self.kill()
             if stop.is_set():
@@ -102,14 +106,15 @@ class JobProcess:
         return _died(process.returncode)
 
     def _last_message(
-        self, deadline_s: float, stop: threading.Event, begun: Callable[[], None]
+        self, timeout_s: float, stop: threading.Event, begun: Callable[[], None]
     ) -> dict[str, object] | None:
-        """The last line that the process writes before it ends; None at the deadline or the
-        stop."""
+        """The last line that the process writes before it ends; None when it takes too long, and
+        at the stop."""
         stdout = self._process.stdout
         assert stdout is not None
         last: dict[str, object] = {}
         pending, warm = b"", False
+        deadline_s = time.monotonic() + WARM_UP_S + timeout_s
         with selectors.DefaultSelector() as selector:
             selector.register(stdout, selectors.EVENT_READ)
             while True:
@@ -124,6 +129,8 @@ class JobProcess:
                 *lines, pending = (pending + piece).split(b"\n")
                 for line in lines:
                     last = json.loads(line)
+                    if "ready" in last:
+                        deadline_s = time.monotonic() + timeout_s
                 if not warm and "step" in last:
                     warm = True
                     begun()

@@ -25,7 +25,7 @@ from station.core.files import private_folder, write_json
 from station.core.scans import ScanId
 from station.core.service import Heartbeat, return_freed_memory, set_up_logs, stop_event
 from station.core.spool import MAX_DEATHS, Claim, Spool
-from workers.reconstruct.job_handle import JobProcess, Outcome
+from workers.reconstruct.job_handle import WARM_UP_S, JobProcess, Outcome
 
 CAMERAS = "cameras"
 """Folder of the spool that gathers what scans say of the cameras, nameless and out of order."""
@@ -36,7 +36,7 @@ _ROUND_S = 0.25
 _RECOVERY_PERIOD_S = 2.0
 _DISK_PAUSE_S = 1.0
 _SLACK_S = 60.0
-"""Beyond a job's time limit, before a worker counts as hanging."""
+"""Beyond the time limits of a job and its warm-up, before a worker counts as hanging."""
 
 
 class Worker:
@@ -170,7 +170,7 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
         if now_s - recovered_s >= _RECOVERY_PERIOD_S:
             recovered_s = now_s
             problem = _recover(config, spool, log)
-        limit_s = config.workers.timeout_s + _SLACK_S
+        limit_s = WARM_UP_S + config.workers.timeout_s + _SLACK_S
         hanging = [w for w in workers if not w.thread.is_alive() or now_s - w.progress_s > limit_s]
         if not hanging:
             heart.beat()
