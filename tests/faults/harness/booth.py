@@ -61,7 +61,9 @@ _HANDED = "handed"
 class Booth:
     """A running booth in a folder."""
 
-    def __init__(self, folder: Path, *, job: str = "", settings: str = _SETTINGS) -> None:
+    def __init__(
+        self, folder: Path, *, job: str = "", settings: str = _SETTINGS, tmp: Path | None = None
+    ) -> None:
         self.folder = folder
         self.path = _record(folder, settings)
         self.config = load_config(self.path)
@@ -74,6 +76,7 @@ class Booth:
             {
                 "PYTHONPATH": str(INSIDE),
                 "BOOTH_JOB_ORDER": str(folder / "job"),
+                **({} if tmp is None else {"TMPDIR": str(tmp)}),
                 **environment(build(folder), folder / "faults", (*_ROLES, _PURGE)),
             },
         )

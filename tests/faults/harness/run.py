@@ -20,6 +20,7 @@ from fuzz_files import file_rows
 from jobs import job_rows
 from kills import kill_rows
 from purge import purge_rows
+from scarcity import scarcity_rows
 from sensors import sensor_rows
 from soak import soak_rows
 from station_disk import errno_rows, small_disk_rows, stall_rows
@@ -61,6 +62,7 @@ PARTS: dict[str, Callable[[Extent], list[Row]]] = {
     "small-disk": lambda _: small_disk_rows(),
     "stalls": lambda e: stall_rows(80, e.seed),
     "errnos": lambda _: errno_rows(),
+    "scarcity": lambda _: scarcity_rows(),
     "soak": lambda e: soak_rows(e.scans, "quick" if e.quick else ""),
 }
 SHORT = ("kills-and-stops", "disk", "files", "messages", "intake", "clocks")
