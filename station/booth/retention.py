@@ -117,7 +117,7 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
                 if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
                     spool.notes.remove(ScanId(scan_id))
                 continue
-            shutil.rmtree(spool.folder / name)
+            spool.remove(spool.folder / name)
             removed.append(spool.folder / name)
         _save(spool, ages)
     return removed
@@ -185,10 +185,12 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
         if not found:
             raise SpoolError(f"there is no scan {name} in {spool.folder}")
         for path in found:
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
+            if path.is_symlink() or not path.is_dir():
                 path.unlink()
+            elif path.parent.name in STATES:
+                spool.remove(path)
+            else:
+                shutil.rmtree(path)
         with held(
             spool.folder / "retention.lock", SpoolError("old scans are being removed; retrying")
         ):

@@ -184,6 +184,15 @@ class ScanFolders:
         """A new name in the spool's own file system; the caller makes the folder."""
         return self.folder / "tmp" / f"{name}.{os.getpid()}.{time.monotonic_ns()}"
 
+    def remove(self, folder: Path) -> None:
+        """Delete a folder: it leaves its place at once, so that nobody finds a part of it there.
+
+        What an interruption leaves is removed by the next sweep.
+        """
+        gone = self.temporary(folder.name if is_scan_id(folder.name) else "removed")
+        os.rename(folder, gone)
+        shutil.rmtree(gone)
+
     def check_space(self, min_free_mb: float) -> None:
         """Refuse a scan before it is taken, rather than lose it after.
 

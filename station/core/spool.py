@@ -69,7 +69,7 @@ class Spool(ScanFolders):
             undo.callback(self.unlock, scan_id, lock)
             if self.path("work", scan_id).exists():
                 # The same scan once more, while a dead worker's waits to be put back: one is kept.
-                shutil.rmtree(self.path("queue", scan_id))
+                self.remove(self.path("queue", scan_id))
                 return None
             note = self.note(scan_id)
             try:
@@ -299,7 +299,7 @@ class Claim:
     def _move(self, state: str) -> None:
         target = self.spool.path(state, self.scan_id)
         if target.exists():
-            shutil.rmtree(target)
+            self.spool.remove(target)
         os.rename(self.bundle, target)
         fsync_folder(target.parent)
         self.close()

@@ -268,6 +268,19 @@ def test_a_note_that_cannot_be_read_leaves_the_scan_unlocked(
     assert spool.waiting() == ["a"]
 
 
+def test_an_interrupted_deletion_leaves_no_part_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr("station.core.scans.shutil.rmtree", _refuse)
+        with pytest.raises(OSError):
+            spool.remove(spool.path("queue", "a"))
+    assert spool.where("a") is None
+    assert spool.claim() is None
+
+
 def test_a_spool_in_two_file_systems_is_refused_before_a_scan(tmp_path: Path) -> None:
     elsewhere = Path("/dev/shm") / f"booth-test-{os.getpid()}"
     elsewhere.mkdir()
