@@ -133,6 +133,7 @@ class _Cutter:
 def _cut(cutter: _Cutter, every: int, real: bool) -> list[Row]:
     found = _lives(real)
     kills = {life.name: cutter.calls(life, changes=False) for life in found}
+    changing = sum(cutter.calls(life, changes=True) for life in found)
     wrong = points = 0
     for life in found:
         for at in range(1, kills[life.name] + 1, every):
@@ -143,7 +144,8 @@ def _cut(cutter: _Cutter, every: int, real: bool) -> list[Row]:
             "kill at a file call",
             "0 torn, lost, doubled",
             f"{points} points of {sum(kills.values())} "
-            f"({', '.join(f'{name}: {calls}' for name, calls in kills.items())}), {wrong} wrong",
+            f"({', '.join(f'{name}: {calls}' for name, calls in kills.items())}), "
+            f"{changing} of which change something, {wrong} wrong",
             wrong == 0,
         )
     ]
