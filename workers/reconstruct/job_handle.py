@@ -21,8 +21,8 @@ from station.core.config import BoothConfig
 
 _LOOK_S = 0.2
 WARM_UP_S = 120.0
-"""Until a process can do a job. It compiles the reconstruction once, which takes most of a minute,
-or more on a busy machine."""
+"""Time until a process can do a job. The first one compiles the reconstruction, which takes most of
+a minute, or more on a busy machine."""
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
 Blame = Literal["scan", "job", "station", "disk", "nobody"]

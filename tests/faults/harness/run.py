@@ -45,7 +45,7 @@ class Extent:
 
 
 PARTS: dict[str, Callable[[Extent], list[Row]]] = {
-    "disk": lambda e: disk_rows(every=1 if e.long else 25, real=e.long),
+    "disk": lambda e: disk_rows(every=1 if e.long else 60, real=e.long),
     "messages": lambda e: message_rows(1_000_000 if e.long else 10_000, e.seed),
     "intake": lambda e: intake_rows(50_000 if e.long else 2_000, e.seed),
     "files": lambda e: _fuzzed_files(100_000 if e.long else 300, e.seed),
