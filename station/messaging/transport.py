@@ -90,8 +90,12 @@ def _bound(
 ) -> zmq.Socket[bytes]:
     socket = _socket(context, kind, hwm)
     address = endpoint(runtime_folder, name)
-    socket.bind(address)
-    Path(address.removeprefix(_SCHEME)).chmod(PRIVATE_FILE_MODE)
+    try:
+        socket.bind(address)
+        Path(address.removeprefix(_SCHEME)).chmod(PRIVATE_FILE_MODE)
+    except (OSError, zmq.ZMQError):
+        socket.close()
+        raise
     return socket
 
 

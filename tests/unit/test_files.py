@@ -11,7 +11,7 @@ import zmq
 from station.console.security.audit import AuditLog
 from station.core import files
 from station.core.errors import BundleError, FormatError
-from station.messaging.transport import server
+from station.messaging.transport import endpoint, server
 
 
 def test_json_round_trip(tmp_path: Path) -> None:
@@ -57,10 +57,12 @@ def test_private_files_are_private_whatever_the_mask(tmp_path: Path) -> None:
         files.write_bytes(tmp_path / "b", b"secret", private=True)
         AuditLog(tmp_path / "c").close()
         with zmq.Context() as context, server(context, tmp_path / "d", "booth"):
-            modes = [path.stat().st_mode & 0o077 for path in tmp_path.rglob("*")]
+            socket = Path(endpoint(tmp_path / "d", "booth").removeprefix("ipc://"))
+            made = [socket, *tmp_path.rglob("*")]
+            modes = {path.name: path.stat().st_mode & 0o077 for path in made}
     finally:
         os.umask(mask)
-    assert modes == [0] * 6
+    assert modes == dict.fromkeys(("booth.ipc", "a", "b", "c", "audit.log", "d"), 0)
 
 
 def test_publish_never_overwrites(tmp_path: Path) -> None:

@@ -125,8 +125,11 @@ COMPARISONS: tuple[Comparison, ...] = (
     ),
     Comparison(_row("hip_depth"), ("buttockdepth",)),
     Comparison(
-        _row("thigh_girth_right"), ("thighcircumference",), (-0.012, -0.012),
-        difference="in the fold below the buttock there, 8 % of the thigh below the crotch here",
+        Definition("upper_thigh_girth", "level, just below the crotch", "girth",
+                   Section(Level(("crotch",), ("knee_right",), 0.05),
+                           ("thigh_right", "pelvis", "shin_right"))),
+        ("thighcircumference",), (-0.012, -0.012),
+        "in the fold below the buttock there, 5 % of the thigh below the crotch here",
     ),
     Comparison(
         Definition("lower_thigh_girth", "level, just above the kneecap", "girth",
