@@ -1,4 +1,4 @@
-"""What a station cannot count on: room in /tmp, a shop that takes its results, memory.
+"""Scarcity: no room in /tmp, a shop that takes no results, no memory.
 
 Five hundred results wait for a target that refuses them; a job is ended for want of memory while
 it works.
