@@ -80,7 +80,7 @@ def bad_scans(model: BodyModel, database: BodyDatabase, count: int) -> Iterator[
         yield BadScan(f"{index:02d} far pose", posed(_FARTHER, _POSES // 2 + index))
         side = ("left", "right")[index % 2]
         parts = [f"{part}_{side}" for part in _DARK[index % len(_DARK)]]
-        dark: NDArray[np.bool_] = np.isin(names, parts)[database.faces].all(axis=1)
+        dark = np.asarray(np.isin(names, parts)[database.faces].all(axis=1))
         yield BadScan(f"{index:02d} no {parts[0]}", usual, dark)
         rng = np.random.default_rng((_SEED, index))
         angle, step_m = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*_STEPS_M)
