@@ -100,7 +100,8 @@ class PredictedError:
     girth_sigma_m: float
     """Girth of 1 m: the largest of those at chest, waist and hip."""
     normal_rms_m: float
-    """The cloud along the surface's normal, rms over a standing body."""
+    """The cloud along the surface's normal, rms over a standing body that is put back where it
+    stood."""
     tilt_sigma_rad: float
     """The world's vertical."""
 

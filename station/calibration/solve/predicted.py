@@ -45,26 +45,28 @@ def predict_errors(
     """
     layout = Layout.of(problem)
 
-    def seen(points: Array, directions: Array) -> Array:
-        rows = _rows(problem.model, layout, world_poses, cameras, points, directions)
+    def seen(points: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
+        rows, covered = _rows(problem.model, layout, world_poses, cameras, points, directions)
         if not len(rows):
             raise CalibrationError(
                 f"no camera sees {points[0, 2]:.2f} m above the mark: turn a camera there, and "
                 "calibrate again"
             )
-        return rows
+        return rows, covered
 
     def sigma(row: Array) -> float:
         return float(np.sqrt(max(float(row @ state.covariance @ row), 0.0)))
 
-    every, girths = [], []
+    every, girths, rigid = [], [], []
     for height_m in (*_LEGS_M, *_RINGS_M.values()):
-        rows = seen(*_ring(height_m))
+        points, normals = _ring(height_m)
+        rows, covered = seen(points, normals)
         every.append(rows)
+        rigid.append(np.concatenate([np.cross(points, normals), normals], axis=1)[covered])
         if height_m in _RINGS_M.values():
             girths.append(sigma(2.0 * np.pi * rows.mean(axis=0)))
-    crown = seen(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0]
-    whole = np.concatenate(every)
+    crown = seen(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0][0]
+    whole = _not_rigid(np.concatenate(every), np.concatenate(rigid))
     variance = np.einsum("ni,ij,nj->n", whole, state.covariance, whole, optimize=True)
     return PredictedError(
         height_sigma_m=sigma(crown),
@@ -72,6 +74,11 @@ def predict_errors(
         normal_rms_m=float(np.sqrt(variance.mean())),
         tilt_sigma_rad=world_poses.slope_sigma_rad,
     )
+
+
+def _not_rigid(rows: Array, rigid: Array) -> Array:
+    """Rows (n, m) without what moves the whole body rigidly, whose rows are (n, 6)."""
+    return np.asarray(rows - rigid @ np.linalg.lstsq(rigid, rows, rcond=None)[0])
 
 
 def _ring(height_m: float) -> tuple[Array, Array]:
@@ -93,8 +100,9 @@ def _ring(height_m: float) -> tuple[Array, Array]:
 def _rows(
     model: SensorModel, layout: Layout, world_poses: WorldPoses,
     cameras: Mapping[str, CameraCalibration], points: Array, directions: Array,
-) -> Array:  # fmt: skip
-    """Derivatives (n, m) of points along directions by all unknowns, of those that are seen."""
+) -> tuple[Array, NDArray[np.bool_]]:  # fmt: skip
+    """Derivatives (k, m) of points (n, 3) along directions by all unknowns, of those that are
+    seen, and which these are (n,)."""
     total, seen = np.zeros((len(points), layout.size)), np.zeros(len(points))
     for place, (name, camera) in enumerate(cameras.items()):
         pose = world_poses.world_from_camera[name]
@@ -129,4 +137,4 @@ def _rows(
         total[good] += weight[:, None] * row
         seen[good] += weight
     covered = seen > 0.0
-    return np.asarray(total[covered] / seen[covered, None])
+    return np.asarray(total[covered] / seen[covered, None]), covered
