@@ -5,30 +5,19 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import cv2
-import numpy as np
 
-from station.calibration.detect.board import (
-    Board,
-    BoardView,
-    check_agreement,
-    find_board,
-    judge_lens,
-)
-from station.calibration.detect.detections import FRONT, MARK
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.procedure import Procedure
-from station.calibration.guide.session import Lens, Session
-from station.calibration.guide.store import CalibrationStore
 from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.errors import CalibrationError
-from station.core.rig import Rig
 
-_IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
+# The rest is imported after the first words: compiled code takes most of a second to load, and
+# several on a busy station.
+if TYPE_CHECKING:
+    from station.calibration.guide.procedure import Procedure
 
 
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -53,6 +42,11 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
                 step = context.invoked_subcommand
                 raise click.UsageError(f"put options after the step: station calibrate {step} ...")
             return None
+        if not kwargs.get("list_them"):
+            click.echo("starting ...")
+        from station.calibration.guide.procedure import Procedure
+        from station.calibration.guide.store import CalibrationStore
+
         config = load_config(find_config(config_path))
         store = CalibrationStore(config.calibrate.folder, config.calibration)
         attended = not yes and recordings is None
@@ -149,6 +143,8 @@ def mark(procedure: Procedure, front: bool) -> None:
       station calibrate mark
       station calibrate mark --front
     """
+    from station.calibration.detect.detections import FRONT, MARK
+
     procedure.rest(FRONT if front else MARK)
 
 
@@ -241,31 +237,10 @@ def board(
     Examples:
       station calibrate board --images board --squares 7x5 --square 0.06 --marker 0.045
     """
-    printed = Board(*_two_numbers(squares), square_m, marker_m, dictionary)
-    session = procedure.session()
-    views: dict[str, list[BoardView]] = {}
-    for name in session.cameras:
-        views[name] = _board_views(images / name, printed, session, name)
-        procedure.guide.say(f"camera {name}: the board is seen in {len(views[name])} images")
-    if not any(views.values()):
-        raise CalibrationError(
-            f"{images} has no image of the board: DIR/<camera>/<moment>.png, cameras "
-            f"{', '.join(session.cameras)}"
-        )
-    if procedure.store.in_use.exists():
-        ties = check_agreement(Rig.load(procedure.store.in_use), views, printed)
-        for (one, other), off_m in ties.pairs.items():
-            procedure.guide.say(
-                f"{one} and {other} see the board's corners {1e3 * off_m:.1f} mm apart "
-                "through the calibration in use"
-            )
-    found: dict[str, Lens | None] = {}
-    for name, seen in views.items():
-        report = judge_lens(session.cameras[name], seen, printed)
-        procedure.guide.say(report.words())
-        lens = report.lens
-        found[name] = None if lens is None else Lens(lens.K.tolist(), lens.distortion.tolist())
-    session.record_lenses(found)
+    from station.calibration.detect.board import Board
+    from station.calibration.guide.lens_board import judge_lenses
+
+    judge_lenses(procedure, images, Board(*_two_numbers(squares), square_m, marker_m, dictionary))
 
 
 def _two_numbers(text: str) -> tuple[int, int]:
@@ -274,23 +249,3 @@ def _two_numbers(text: str) -> tuple[int, int]:
     except ValueError:
         raise CalibrationError(f"--squares {text}: give it as across x down, 7x5") from None
     return columns, rows
-
-
-def _board_views(folder: Path, printed: Board, session: Session, name: str) -> list[BoardView]:
-    camera = session.cameras[name]
-    views = []
-    for path in sorted(folder.glob("*")) if folder.is_dir() else []:
-        if path.suffix.lower() not in _IMAGES:
-            continue
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise CalibrationError(f"{path} cannot be read as an image; remove it")
-        if image.shape != (camera.height, camera.width):
-            raise CalibrationError(
-                f"{path} is {image.shape[1]} x {image.shape[0]}; camera {name} has "
-                f"{camera.width} x {camera.height}"
-            )
-        view = find_board(np.asarray(image, np.uint8), printed, path.stem)
-        if view is not None:
-            views.append(view)
-    return views
