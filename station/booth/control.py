@@ -102,8 +102,7 @@ class ControlProcess:
             if now_s - self._tidied_s > _TIDY_PERIOD_S:
                 self._tidied_s = now_s
                 self._tidy()
-            if self._purge is not None and self._purge.poll() is not None:
-                self._purge = None
+            self._look_at_purge()
             self._heart.beat()
             if self._heart.due:
                 self._heart.report(
@@ -131,15 +130,26 @@ class ControlProcess:
         """
         try:
             self._spool.sweep()
-            if self._purge is None:
-                command = [sys.executable, "-m", "station.cli", "purge", "--old"]
-                self._purge = subprocess.Popen(
-                    [*command, "--config", str(self._config_path)],
-                    stdin=subprocess.DEVNULL,
-                    preexec_fn=partial(die_with_parent, os.getpid()),
-                )
+            if self._purge is not None:
+                # It hangs, or there is very much; the next one goes on where this one ends.
+                self._purge.kill()
+                return
+            command = [sys.executable, "-m", "station.cli", "purge", "--old"]
+            self._purge = subprocess.Popen(
+                [*command, "--config", str(self._config_path)],
+                stdin=subprocess.DEVNULL,
+                preexec_fn=partial(die_with_parent, os.getpid()),
+            )
         except OSError as error:
             self._log.warning("old scans could not be removed: %s", error)
+
+    def _look_at_purge(self) -> None:
+        code = None if self._purge is None else self._purge.poll()
+        if code is None:
+            return
+        if code != 0:
+            self._log.warning("old scans could not be removed: the purge ended with %d", code)
+        self._purge = None
 
     def _receive(self) -> None:
         parts = self._events.recv_multipart()

@@ -226,10 +226,10 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         removed = purge_scan(spool, scan_id)
     else:
         removed = _purge_label(spool, str(label))
-    # Labels leave the index together with the scans, not at the next query.
-    ScanIndex(spool).find(limit=0)
     for folder in removed:
         click.echo(f"removed {folder}")
+    # Labels leave the index together with the scans, not at the next query.
+    ScanIndex(spool).find(limit=0)
 
 
 def _purge_label(spool: Spool, label: str) -> list[Path]:

@@ -57,7 +57,10 @@ def open_private(path: str | Path, flags: int) -> int:
 
 
 def private_file(path: Path) -> Path:
-    """Create an empty file that only its owner may read, if there is none."""
+    """Create an empty file that only its owner may read, if there is none.
+
+    Not for a database that this process has open: to close the file would drop its locks.
+    """
     os.close(open_private(path, os.O_RDWR | os.O_CREAT))
     return path
 

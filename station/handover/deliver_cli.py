@@ -14,7 +14,7 @@ from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
-from station.core.errors import BoothError
+from station.core.errors import BoothError, SpoolError
 from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
@@ -61,7 +61,7 @@ class HandOver:
                     self.look()
                     changed_ns = now_ns
                 problem = ""
-            except OSError as error:
+            except (OSError, SpoolError) as error:
                 problem = f"deliver: the spool cannot be read ({error}); check its disk"
             self._heart.beat()
             if self._heart.due:

@@ -14,6 +14,7 @@ from station.booth.retention import FILE, Moment, expire_old, purge_scan
 from station.core.config import RetentionConfig
 from station.core.scans import REASON, ScanId, ScanNote
 from station.core.spool import Spool
+from workers.reconstruct.job_handle import WARM_UP_S
 
 _DAY_S = 86_400.0
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
@@ -27,7 +28,7 @@ def _serve_until_failed(folder: Path, scan_id: str, workers: str) -> str:
     )
     reason = folder / "spool/failed" / scan_id / REASON
     try:
-        deadline_s = time.monotonic() + 60.0
+        deadline_s = time.monotonic() + 60.0 + 2 * WARM_UP_S
         while not reason.exists():
             assert time.monotonic() < deadline_s
             assert process.poll() is None

@@ -79,11 +79,14 @@ class JobProcess:
             begun: called once, when the process is warm and does its job.
         """
         process = self._process
-        last = self._last_message(timeout_s, stop, begun)
+        last, warm = self._last_message(timeout_s, stop, begun)
         if last is None:
             self.kill()
             if stop.is_set():
                 return Outcome(reason="the station was stopped")
+            if not warm:
+                reason = f"the process for the job was not ready after {WARM_UP_S:g} s"
+                return Outcome(reason=reason, blame="station")
             return Outcome(
                 reason=f"the job was not done after {timeout_s:g} s and was stopped", blame="job"
             )
@@ -107,32 +110,32 @@ class JobProcess:
 
     def _last_message(
         self, timeout_s: float, stop: threading.Event, begun: Callable[[], None]
-    ) -> dict[str, object] | None:
-        """The last line that the process writes before it ends; None when it takes too long, and
-        at the stop."""
+    ) -> tuple[dict[str, object] | None, bool]:
+        """The last line that the process writes before it ends, None when it takes too long and at
+        the stop; and whether the process was ready for the job."""
         stdout = self._process.stdout
         assert stdout is not None
         last: dict[str, object] = {}
-        pending, warm = b"", False
-        deadline_s = time.monotonic() + WARM_UP_S + timeout_s
+        pending, ready, at_work = b"", False, False
+        deadline_s = time.monotonic() + WARM_UP_S
         with selectors.DefaultSelector() as selector:
             selector.register(stdout, selectors.EVENT_READ)
             while True:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0 or stop.is_set():
-                    return None
+                    return None, ready
                 if not selector.select(min(left_s, _LOOK_S)):
                     continue
                 piece = stdout.read1(65536)  # type: ignore[attr-defined]  # a BufferedReader
                 if not piece:
-                    return last
+                    return last, ready
                 *lines, pending = (pending + piece).split(b"\n")
                 for line in lines:
                     last = json.loads(line)
                     if "ready" in last:
-                        deadline_s = time.monotonic() + timeout_s
-                if not warm and "step" in last:
-                    warm = True
+                        ready, deadline_s = True, time.monotonic() + timeout_s
+                if not at_work and "step" in last:
+                    at_work = True
                     begun()
 
     def kill(self) -> None:

@@ -122,7 +122,8 @@ class Tasks:
                 text=True,
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )
-        except OSError as error:
+        except BaseException as error:
+            # Whoever waits for the process waits for ever otherwise.
             started.set_exception(error)
             return
         started.set_result(process)

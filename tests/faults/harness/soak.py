@@ -79,6 +79,9 @@ def _look_at_console(booth: Booth) -> int:
         except urllib.error.HTTPError as error:
             print(f"        {path}: {error.code} {error.read().decode()}", flush=True)
             failed += 1
+        except OSError as error:
+            print(f"        {path}: {error}", flush=True)
+            failed += 1
     return failed
 
 
