@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
-from workers.scape.fit.verdict import PartReport, judge, lost_parts
+from workers.scape.fit.verdict import PartReport, arms_inside, judge, lost_parts
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 
@@ -59,6 +59,24 @@ def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:
     assert verdict.status == "rescan"
     assert verdict.missing
     assert all(part.endswith("_left") for part in verdict.missing)
+
+
+def test_an_arm_that_the_fit_put_into_the_trunk_is_named(model: BodyModel) -> None:
+    assert arms_inside(model, model.mean) == {}
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("upper_arm_left"), 1] = np.radians(60.0)
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    verdict = _verdict(model, arms_inside(model, model.vertices(state)), {})
+    assert verdict.status == "rescan"
+    assert "the left forearm was not found" in verdict.reasons[0]
+    assert set(verdict.missing) == {"upper_arm_left", "forearm_left", "hand_left"}
+
+
+def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
+    sides = {"front": 0.9, "back": 0.9}
+    parts = [PartReport("thigh_right", 0.1, 1e-3), PartReport("shin_right", 0.4, 1e-3)]
+    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    assert set(verdict.missing) == {"thigh_right", "shin_right", "foot_right"}
 
 
 def test_folds_and_stray_readings_are_no_lost_limb(model: BodyModel) -> None:

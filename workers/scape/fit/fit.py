@@ -37,6 +37,7 @@ from workers.scape.fit.unmatched import Patch, unmatched_patches
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
+    arms_inside,
     judge,
     lost_parts,
     report_parts,
@@ -228,7 +229,7 @@ def separate_limbs(
         vertices = untangled(model, vertices, fit.reference, surface.measured)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
-    lost = lost_parts(model, fit.patches)
+    lost = {**arms_inside(model, fit.vertices), **lost_parts(model, fit.patches)}
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
+from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
@@ -55,6 +56,11 @@ _OTHER_SIDE = 0.75
 """Share of the left side's coverage that the right side has at least, and the other way round: of
 half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
+_CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
+"""Parts of a limb, outwards."""
+_INSIDE = 0.3
+"""Share of a forearm inside the body from which the arm was not found: 0 in sound scans, 0.54 and
+more where the fit put the arm into the trunk, whose points then pass for the arm's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +181,7 @@ def judge(
     Args:
         sides: what `sides_seen` gives.
         findings: what preprocessing noticed; each is a reason.
-        lost: what `lost_parts` gives.
+        lost: what `lost_parts` and `arms_inside` give.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
     """
@@ -205,6 +211,7 @@ def judge(
             missing.append(part.name)
             unseen.add(part.name)
     halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
+    missing = _with_rest_of_limbs(missing, lost)
     if halved:
         missing += [
             part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
@@ -245,6 +252,31 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
                 f"{1e3 * patch.distance_m:.0f} mm away)",
             )
     return reasons
+
+
+def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
+    """Reasons by the forearm that lies inside the body.
+
+    Args:
+        vertices: (P, 3), the fitted surface before crossings are mended.
+    """
+    shares = shares_inside(model, vertices, [f"forearm_{side}" for side in _LIMBS])
+    return {
+        part: f"the {part_in_words(part)} was not found: hold both arms away from the body"
+        for part, share in shares.items()
+        if share > _INSIDE
+    }
+
+
+def _with_rest_of_limbs(missing: Sequence[str], lost: Mapping[str, str]) -> list[str]:
+    """Missing parts, what is farther out, and the whole limb whose middle is somewhere else."""
+    found = list(missing)
+    for chain in _CHAINS:
+        for side in _LIMBS:
+            limb = [f"{part}_{side}" for part in chain]
+            first = next((place for place, part in enumerate(limb) if part in missing), len(limb))
+            found += limb if limb[1] in lost else limb[first:]
+    return found
 
 
 def _part_reasons(part: PartReport) -> list[str]:
