@@ -24,7 +24,7 @@ help:
 	@echo "make evaluate-model   tables of the body model on held-out bodies"
 	@echo "make intervals  learn the measurements' intervals, after any change to model or fit"
 	@echo "make test-faults   kill, stop, starve and fuzz the station: the short form (a minute)"
-	@echo "make soak     the long form, then 1,440 scans; ARGS=\"--only soak --scans 100\""
+	@echo "make soak     the long form, then 1,440 scans after 720 to warm up; ARGS=\"--only soak --scans 100\""
 	@echo "make package  the Debian packages, wheel and source distribution of this commit, in dist/"
 	@echo "make test-install   install them on a fresh Debian under systemd and test them (root)"
 	@echo "make lock     update the packages' pinned dependencies"
