@@ -32,7 +32,6 @@ from station.calibration.adjust.widths import (
     CLASSES,
     FIELD_LEVELS,
     LENS,
-    LEVELS,
     RADIUS,
     SENSOR,
     SHAPE_LEVELS,
@@ -40,7 +39,9 @@ from station.calibration.adjust.widths import (
     Widths,
     lens_log_prior,
     sigma,
+    sound_level,
     width_options,
+    worst_level,
 )
 
 Array = NDArray[np.float64]
@@ -246,8 +247,9 @@ class _SmoothChoice:
         )
 
     def _search(self, start: Choice | None) -> tuple[Choice, float]:
-        """The choice with the largest evidence, from the narrowest and the widest priors."""
-        ends = [(0,) * len(CLASSES), (LEVELS - 1,) * len(CLASSES)]
+        """The choice with the largest evidence, from the narrowest, sound and widest priors."""
+        ends = [(0,) * len(CLASSES)]
+        ends += [tuple(level(name) for name in CLASSES) for level in (sound_level, worst_level)]
         found = [self._climb(choice) for choice in (ends if start is None else [*ends, start])]
         return max(found, key=lambda one: one[1])
 
