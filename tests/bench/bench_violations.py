@@ -136,7 +136,6 @@ def summary(verdicts: Sequence[Verdict]) -> None:
     beyond = sum(one.beyond_twice for one in accepted)
     hold = 100.0 * np.mean(ratios[:, :2] < 1.96, axis=0)
     chi2 = np.array([one.chi2 for one in accepted])
-    chi2 = np.array([one.chi2 for one in accepted])
     # Includes the simulation.
     memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f"\n{len(accepted)} of {len(verdicts)} booths accepted")
