@@ -22,8 +22,13 @@ Mask = NDArray[np.bool_]
 
 _RADIUS_CERTAIN, _RADIUS_ALIKE = 0.045, 0.05
 """Standard deviation of a detection's own radius, and its distance from the camera's median, as
-shares of the radius. With a hand over the ball and a second person in the booth 22 % of 203
-detections were off by more than 5 mm, of those within both limits 1 %."""
+shares of the radius."""
+_COVERED_CERTAIN, _COVERED = 0.02, 1.2
+"""Standard deviation of the radius of a ball that is partly covered, as a share of the radius; a
+ball is if it is so many times less certain than a whole one."""
+_WHOLE_SIGMA_PER_M = 3.8e-5
+"""A whole ball's radius R at the distance z is measured to k z^3 / R^2, as a share of R: from
+`station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
 _RADIUS_SLACK = 0.10
 """Distance from the stated radius: a depth error of 1 % changes it by 1 %."""
 _MIN_AT_REST = 5
@@ -59,7 +64,9 @@ def sorted_detections(
     """Each camera's detections of the whole ball, in the order of time.
 
     A hand that covers part of the ball, a head or a fist shows as a radius of its own: only
-    detections are kept whose radius is certain and that of the camera's typical detection.
+    detections are kept whose radius is certain and that of the camera's typical detection. What is
+    covered in part must be more certain than a whole ball far away: the edge of a hand looks like
+    the ball's, and shifts it by more than noise does.
     """
     found = {}
     for name in cameras:
@@ -67,7 +74,7 @@ def sorted_detections(
             detection
             for detection in detections
             if detection.camera == name
-            and (not held or detection.radius_sigma_m < _RADIUS_CERTAIN * radius_m)
+            and (not held or _certain(detection, radius_m))
             and abs(detection.radius_m - radius_m) < _RADIUS_SLACK * radius_m
         ]
         typical_m = float(np.median([ball.radius_m for ball in sure])) if sure else radius_m
@@ -83,6 +90,12 @@ def sorted_detections(
             ),
         )
     return found
+
+
+def _certain(ball: BallDetection, radius_m: float) -> bool:
+    share = ball.radius_sigma_m / radius_m
+    whole = _WHOLE_SIGMA_PER_M * float(ball.center_m[2]) ** 3 / radius_m**2
+    return share < min(_RADIUS_CERTAIN, max(_COVERED_CERTAIN, _COVERED * whole))
 
 
 def agreeing_detections(
