@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 _RADIUS_CERTAIN, _RADIUS_ALIKE = 0.045, 0.05
 """Standard deviation of a detection's own radius, and its distance from the camera's median, as
 shares of the radius."""
-_COVERED_CERTAIN, _COVERED = 0.02, 1.2
+_COVERED_CERTAIN, _COVERED = 0.034, 1.1
 """Standard deviation of the radius of a ball that is partly covered, as a share of the radius; a
 ball is if it is so many times less certain than a whole one."""
 _WHOLE_SIGMA_PER_M = 3.8e-5
