@@ -10,7 +10,7 @@ PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 # factor of 1,100 unknowns takes ten times as long.
 test: export OPENBLAS_NUM_THREADS = 1
 test: export OMP_NUM_THREADS = 1
-BENCHES := bench-capture bench-console bench-fit bench-paper bench-detail bench-measure bench-verdict bench-calibration bench-violations bench-detections bench-drift
+BENCHES := bench-capture bench-console bench-fit bench-paper bench-detail bench-measure bench-verdict bench-calibration bench-violations bench-detections bench-drift bench-people
 
 .PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
@@ -92,8 +92,8 @@ lock: $(VENV)/dev.stamp
 
 # The benchmarks of fit and measurements render held-out bodies, which needs
 # the training extra.
-bench-fit bench-paper bench-detail bench-measure bench-verdict: $(VENV)/train.stamp
-bench-capture bench-calibration bench-violations bench-detections bench-drift: $(VENV)/dev.stamp
+bench-fit bench-paper bench-detail bench-measure bench-verdict bench-violations bench-people: $(VENV)/train.stamp
+bench-capture bench-calibration bench-detections bench-drift: $(VENV)/dev.stamp
 bench-console: $(VENV)/dev.stamp $(VENV)/chromium.stamp
 bench-console: export PYTHONPATH = tests
 $(BENCHES): bench-%:

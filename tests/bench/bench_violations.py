@@ -2,7 +2,7 @@
 
 Each row is one violation of `station.simulation.violations`; its parameters are drawn from
 distributions that the solution never reads. Detections are drawn directly, or found in rendered
-images (--images).
+images (--images). With --scans a body is scanned, fitted and measured in each booth, too.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import synthetic_calibration as synthetic
 from calibrated_booths import normalised_square, pair_errors, solved
 from scan_distortion import Distortion, distortion
+from violated_scans import ScannedRows, scan_rows
 
 from station.calibration.detect.detections import Observations
 from station.core.errors import CalibrationError
@@ -31,6 +33,8 @@ from station.simulation.observations import simulate
 from station.simulation.procedure import VirtualProcedure
 from station.simulation.scene import load_mesh
 from station.simulation.sensor import SimulatedBooth
+from workers.reconstruct.job import warm_up
+from workers.scape.model.body_model import BodyModel
 
 _BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 CASES: dict[str, tuple[str, ...]] = {
@@ -72,10 +76,12 @@ class Verdict:
     """Accepted, with an error of more than twice a bar."""
     seconds: float = 0.0
     """Processor time of the solution."""
+    rows: ScannedRows | None = None
+    """A body scanned in this booth."""
 
 
-def judge(name: str, seed: int, images: bool) -> Verdict:
-    """One booth's row of the table."""
+def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) -> Verdict:
+    """One booth's row of the table; a body is scanned in it if there is a model."""
     booth = synthetic.booth(seed, switches=CASES[name])
     seen = observe(booth, images)
     start_s = time.process_time()
@@ -124,7 +130,12 @@ def judge(name: str, seed: int, images: bool) -> Verdict:
         middle_mm / (1e3 * predicted.girth_sigma_m),
         found.tilt_deg / tilt_sigma_deg,
     )
-    return Verdict(words, ratios, float(chi2), beyond_twice, seconds)
+    rows = None
+    if model is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            rows = scan_rows(model, booth, solution.rig, Path(folder))
+        words += f"\n{rows.words()}"
+    return Verdict(words, ratios, float(chi2), beyond_twice, seconds, rows)
 
 
 def summary(verdicts: Sequence[Verdict]) -> None:
@@ -144,6 +155,14 @@ def summary(verdicts: Sequence[Verdict]) -> None:
         _bar(f"{what} within their stated 95 % (%)", share, share >= 93.0, ">= 93")
     _bar("chi2 a number, mean", chi2.mean(), 0.5 <= chi2.mean() <= 3.0, "0.5 to 3")
     _bar("chi2 a number, worst", chi2.max(), chi2.max() <= 3.0, "<= 3")
+    scanned = [one.rows for one in accepted if one.rows is not None]
+    delivered = [rows for rows in scanned if rows.status == "ok"]
+    if delivered:
+        print(f"  {len(delivered)} of {len(scanned)} scans delivered")
+        share = 100.0 * float(np.mean([rows.held.mean() for rows in delivered]))
+        _bar("intervals that hold the truth (%)", share, share >= 93.0, ">= 93")
+        share = 100.0 * float(np.mean([rows.held_other.mean() for rows in delivered]))
+        _bar("... what a true calibration gives (%)", share, share >= 93.0, ">= 93")
     slowest_s = max(one.seconds for one in accepted)
     _bar("solving, worst (s of one core)", slowest_s, slowest_s <= 20.0, "<= 20")
     _bar("memory, simulation included (MB)", memory_mb, memory_mb <= 1024.0, "<= 1024")
@@ -168,7 +187,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=1, help="seed of the first booth")
     parser.add_argument("--case", action="append", choices=list(CASES), help="only these")
     parser.add_argument("--images", action="store_true", help="find the ball in rendered images")
+    parser.add_argument("--scans", action="store_true", help="scan and measure a body in each")
     given = parser.parse_args(arguments)
+    model = warm_up() if given.scans else None
     cases = given.case or (list(CASES) if given.images else _DIRECT)
     print(
         f"{'violated':<20}{'seed':>4}{'pairs':>7}{'worst':>6}{'chi2/n':>7}"
@@ -178,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verdicts = []
     for name in cases:
         for seed in range(given.first, given.first + given.seeds):
-            verdicts.append(judge(name, seed, given.images))
+            verdicts.append(judge(name, seed, given.images, model))
             print(verdicts[-1].words, flush=True)
     summary(verdicts)
 
