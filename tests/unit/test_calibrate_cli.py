@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -195,3 +198,19 @@ def test_an_option_before_the_step_is_not_dropped(config: Path) -> None:
     result = CliRunner().invoke(calibrate, ["--config", str(config), "--new", "ball"])
     assert result.exit_code == 2
     assert "station calibrate ball" in result.output
+
+
+def test_a_replay_speaks_within_a_second(config: Path, tmp_path: Path) -> None:
+    """It was silent for seconds while compiled code was loaded. Processor time, as the tests share
+    the machine."""
+    command = [sys.executable, "-m", "station.cli", "calibrate", "--config", str(config)]
+    with subprocess.Popen(
+        [*command, "--recordings", str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        words = process.stdout.readline()
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+        process.kill()
+    assert words == "starting ...\n"
+    ticks = int(fields[11]) + int(fields[12])
+    assert ticks / os.sysconf("SC_CLK_TCK") < 1.0
