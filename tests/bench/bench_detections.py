@@ -1,8 +1,9 @@
 """Detections of a waved ball in rendered images, with hand, arm and a walking helper in view.
 
 How far the ball is from where it is found: of all detections, of those that a calibration keeps by
-their radius, and of those that are left once the cameras are compared, which is what it uses. (The
-weights of its solution are not looked at.) The sensors have noise but no systematic errors.
+their radius, and of those that are left once the cameras are compared, which is what it uses. It
+weighs these by how far each lies off the ball's path, for which the true path stands here. The
+sensors have noise but no systematic errors.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import synthetic_calibration as synthetic
 
+from station.calibration.adjust.equations import TREMOR_M
+from station.calibration.adjust.residuals import robust_weight
 from station.calibration.detect.ball import find_ball
 from station.calibration.detect.detections import BALL, EMPTY, BallDetection
 from station.calibration.detect.scene import static_view
@@ -84,8 +87,20 @@ def agreeing(
     return found
 
 
-def judge(seed: int, rate_hz: float) -> tuple[Array, Array, Array]:
-    """Errors (n,) of one booth, mm: of what is found, of what is kept, of what is used."""
+def weights(procedure: VirtualProcedure, name: str, used: Sequence[BallDetection]) -> Array:
+    """Weights (n,) that a solution gives to the detections of a camera."""
+    if not used:
+        return np.zeros(0)
+    turn = procedure.booth.rig.cameras[name].world_from_camera[:3, :3]
+    off = off_m(procedure, name, used) @ turn
+    spread = np.array([ball.covariance_m2 for ball in used]) + TREMOR_M**2 * np.eye(3)
+    deviation = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
+    return robust_weight(deviation)
+
+
+def judge(seed: int, rate_hz: float) -> tuple[Array, Array, Array, Array]:
+    """Errors (n,) of one booth, mm: of what is found, of what is kept, of what is used; and the
+    weights of the last."""
     procedure = VirtualProcedure(synthetic.booth(seed, bias_m=0.0, switches=SWITCHES))
     found, kept, errors, off = {}, {}, {}, {}
     for name in procedure.booth.rig.cameras:
@@ -102,13 +117,23 @@ def judge(seed: int, rate_hz: float) -> tuple[Array, Array, Array]:
             for own in (errors[name], kept_mm[name], used_mm[name])
         ]
         print(f"{seed:>4} {name:<14}{''.join(cells)}", flush=True)
-    every, some, last = (np.concatenate(list(own.values())) for own in (errors, kept_mm, used_mm))
-    return every, some, last
+    weighed = {
+        name: weights(
+            procedure, name, [ball for ball, good in zip(own, agreed[name], strict=True) if good]
+        )
+        for name, own in kept.items()
+    }
+    every, some, last, weight = (
+        np.concatenate(list(own.values())) for own in (errors, kept_mm, used_mm, weighed)
+    )
+    return every, some, last, weight
 
 
-def _far_share(errors_mm: Array) -> float:
-    """Percentage of the errors (n,) that are too large."""
-    return 100.0 * float(np.mean(errors_mm > _FAR_MM)) if len(errors_mm) else 0.0
+def _far_share(errors_mm: Array, weight: Array | None = None) -> float:
+    """Percentage of the errors (n,), weighed, that are too large."""
+    if not len(errors_mm):
+        return 0.0
+    return 100.0 * float(np.average(errors_mm > _FAR_MM, weights=weight))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -120,13 +145,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     columns = "".join(f"{what:>7}{'> 5 mm %':>9}{'worst':>8}" for what in ("found", "kept", "used"))
     print(f"{'seed':>4} {'camera':<14}{columns}")
     booths = [judge(seed, given.rate) for seed in range(given.first, given.first + given.seeds)]
-    found, kept, used = (np.concatenate(group) for group in zip(*booths, strict=True))
+    found, kept, used, weight = (np.concatenate(group) for group in zip(*booths, strict=True))
     verdict = "met" if _far_share(used) <= _LARGEST_SHARE else "MISSED"
     if len(used) < _ENOUGH:
         verdict += f", but fewer than {_ENOUGH} say little"
     print(
         f"\nof {len(used)} detections that are used, {_far_share(used):.2f} % are off by more than "
         f"{_FAR_MM:g} mm  <= {_LARGEST_SHARE:g}  {verdict}"
+    )
+    print(
+        f"  as the solution weighs them {_far_share(used, weight):.2f} %; {np.sum(weight == 0.0)} "
+        "get no weight"
     )
     print(
         f"  before the cameras are compared {_far_share(kept):.2f} % of {len(kept)}; of all found "

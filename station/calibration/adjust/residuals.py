@@ -63,7 +63,7 @@ class DetectionResiduals:
         rows = _rows(problem, state, seen, near, shape)
         balls = _without_sensor(seen, rows).moved(centers - near)
         deviation = _deviation(balls.marginalised(problem.radius_m, np.ones(len(centers))))
-        return cls(centers, near, rows, deviation, _robust_weight(deviation), *basis)
+        return cls(centers, near, rows, deviation, robust_weight(deviation), *basis)
 
     @classmethod
     def at_rest(
@@ -73,7 +73,7 @@ class DetectionResiduals:
         rows = _rows(problem, state, seen, centers, shape)
         deviation = _deviation(_without_sensor(seen, rows))
         basis = (np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros((0, 4)))
-        return cls(centers, centers, rows, deviation, _robust_weight(deviation), *basis)
+        return cls(centers, centers, rows, deviation, robust_weight(deviation), *basis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def _near(centers: Array, detected: Array) -> Array:
     return np.asarray(np.where(usable[:, None], centers, near))
 
 
-def _robust_weight(deviation: Array) -> Array:
+def robust_weight(deviation: Array) -> Array:
     """Weights (n,) that leave out what deviates far more than most do.
 
     Deviations are relative to the typical one: before the depth errors are corrected, all
