@@ -7,7 +7,7 @@ pixels; people differ from scan to scan, sway, bring bags, move chairs and lean 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from station.calibration.detect.scene import StaticView, static_view
 from station.core.geometry import rigid, se3_exp, so3_exp, transform
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
-from station.core.rig import CameraCalibration
+from station.core.rig import CameraCalibration, Rig
 from station.simulation import violations
 from station.simulation.noise import NoiselessView
 from station.simulation.scene import (
@@ -55,6 +55,8 @@ _ANOTHER_DAY = 0.3
 _SWAY_M = 0.003
 _HOLE = np.ones((5, 5), np.uint8)
 _CHAIR_M = (0.75, 0.45)
+_SEES = 0.3
+"""Share of readings in the image of a camera that somebody would mount so."""
 
 
 def random_body(rng: np.random.Generator) -> Mesh:
@@ -99,30 +101,19 @@ class DriftBooth:
         self.seed, self.room = seed, room
         rng = np.random.default_rng((seed, 21))
         rig = default_rig()
-        sigma = np.array([_RIG_TURN_RAD] * 3 + [_RIG_SHIFT_M] * 3)
-        cameras = {
-            name: replace(
-                camera,
-                world_from_camera=camera.world_from_camera
-                @ se3_exp(sigma * rng.standard_normal(6)),
-            )
-            for name, camera in rig.cameras.items()
-        }
-        switches = {violations.BIAS, violations.FROZEN}
-        if seed % 2:
-            switches |= {violations.LENS, violations.K1, violations.RAW_LAW}
-        booth = SimulatedBooth(
-            rig=replace(rig, cameras=cameras),
-            seed=seed,
-            bias_m=0.005,
-            violations=frozenset(switches),
-        )
+        cameras = {name: _mounted(camera, rng) for name, camera in rig.cameras.items()}
         self._chair_turn = rng.uniform(0.0, 2.0 * np.pi)
         self._fixed = _fixtures(room)
-        self.sensors = {
-            name: DriftSensor(booth, name, VirtualScene([*self._fixed, *self._chair(0.0, 0.0)]))
-            for name in cameras
-        }
+        empty = VirtualScene([*self._fixed, *self._chair(0.0, 0.0)])
+        self.sensors: dict[str, DriftSensor] = {}
+        for name, camera in rig.cameras.items():
+            while True:
+                sensor = DriftSensor(_drift_booth(seed, rig, cameras), name, empty)
+                # Nobody calibrates a camera that is mounted inside a post and sees nothing.
+                if sensor.stored.share.mean() > _SEES:
+                    break
+                cameras[name] = _mounted(camera, rng)
+            self.sensors[name] = sensor
 
     def visit(self, kind: Scene, seed: int) -> Visit:
         """One scan's scene."""
@@ -155,6 +146,25 @@ class DriftBooth:
             return []
         x, y = _CHAIR_M
         return [placed(part, x + dx, y + dy, self._chair_turn) for part in chair((0.0, 0.0))]
+
+
+def _mounted(camera: CameraCalibration, rng: np.random.Generator) -> CameraCalibration:
+    """A camera on a mount of another booth."""
+    sigma = np.array([_RIG_TURN_RAD] * 3 + [_RIG_SHIFT_M] * 3)
+    off = se3_exp(sigma * rng.standard_normal(6))
+    return replace(camera, world_from_camera=camera.world_from_camera @ off)
+
+
+def _drift_booth(seed: int, rig: Rig, cameras: Mapping[str, CameraCalibration]) -> SimulatedBooth:
+    switches = {violations.BIAS, violations.FROZEN}
+    if seed % 2:
+        switches |= {violations.LENS, violations.K1, violations.RAW_LAW}
+    return SimulatedBooth(
+        rig=replace(rig, cameras=dict(cameras)),
+        seed=seed,
+        bias_m=0.005,
+        violations=frozenset(switches),
+    )
 
 
 class DriftSensor:
