@@ -20,7 +20,6 @@ from station.simulation.scene import (
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.evidence.crown import crown_rows, crown_sigma_m
-from workers.scape.evidence.rims import rims_of
 from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
@@ -174,7 +173,7 @@ def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
     def missing(views: list[CameraView]) -> float:
         poses = [view.calibration.world_from_camera for view in views]
         crown = partial(crown_rows, model, views, poses)
-        fitted = fit_surface(model, body, cloud, rims_of((), cloud.camera_names, ()), crown)
+        fitted = fit_surface(model, body, cloud, crown)
         return float(higher[:, 2].max() - fitted.vertices[:, 2].max())
 
     assert missing([]) > 0.002

@@ -51,6 +51,5 @@ MIDDLE = tuple(
     for _ in range(2)
 )
 FINE = tuple(
-    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 0.60)
-    for _ in range(3)
+    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2) for _ in range(3)
 )

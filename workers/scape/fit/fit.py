@@ -195,7 +195,7 @@ def fit_overlapping(
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         crown = partial(crown_rows, model, scan.views, cameras.poses(scan.views))
-        surface = fit_surface(model, reference, cloud, cameras.corrected(joint.rims), crown)
+        surface = fit_surface(model, reference, cloud, crown)
     poses = cameras.poses(scan.views)
     crown_sigma = crown_sigma_m(model, scan.views, poses, surface.vertices, cloud.points)
     patches = unmatched_patches(model, surface.vertices, cloud)

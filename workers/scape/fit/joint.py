@@ -1,8 +1,9 @@
 """Joint estimation of pose, shape and translation by Gauss-Newton on point-to-plane distances.
 
-Every correspondence is a point p, a vertex v and the vertex's normal n. Its residual n . (p - y_v)
-is exact, its derivative is that of the sample vertex nearest to v on the template, J_s (3 x D).
-While the fit is coarse, some sample vertices represent the whole surface.
+Every correspondence is a point p, its normal n and the place x of the skin nearest to it. Its
+residual n . (p - y(x)) is exact, its derivative is that of the sample vertex nearest to x on the
+template, J_s (3 x D). While the fit is coarse, some sample vertices represent the whole surface,
+and x is one of them, n its normal.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from workers.cloud.observed import PointCloud
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
 from workers.scape.evidence.correspondence import TrackedPoints
 from workers.scape.evidence.rows import CameraTerms
@@ -56,8 +56,6 @@ class JointResult:
     cameras: CameraCorrections
     vertices: Array
     """(P, 3), the model's surface."""
-    rims: PointCloud
-    """Outlines of the hands that were used."""
     correspondences: int
     """Number of pairs in the last step."""
     iterations: int
@@ -100,7 +98,7 @@ def fit_jointly(
             skin = (sampling.coarse_skin if annealing.coarse else sampling.skin)(model, state)
             probed = beside.submit(probed_places, model, target, skin, annealing)
             bounds = beside.submit(bound_rows, model, target, cameras, skin, annealing)
-            terms = data_terms(target, tracked, probed, bounds, cameras, skin, annealing)
+            terms = data_terms(model, target, tracked, probed, bounds, cameras, skin, annealing)
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
@@ -113,7 +111,6 @@ def fit_jointly(
         state,
         cameras,
         model.vertices(state),
-        target.rims,
         len(terms.on_body),
         len(schedule),
         evidence,

@@ -23,6 +23,7 @@ from workers.scape.evidence.rims import rims_of
 from workers.scape.evidence.rows import CameraTerms, Rows, Skin, outline_rows
 from workers.scape.fit.annealing import AnnealingStep
 from workers.scape.model.body_model import BodyModel
+from workers.scape.surface.attachment import attached
 
 Array = NDArray[np.float64]
 
@@ -96,7 +97,7 @@ class DataTerms:
     cameras: CameraTerms | None
     """None while the corrections are kept fixed."""
     on_body: Array
-    """(m, 3), vertices of the correspondences."""
+    """(m, 3), places of the skin in the correspondences."""
     on_cloud: Array
     """(m, 3), their points."""
 
@@ -146,6 +147,7 @@ def bound_rows(
 
 
 def data_terms(
+    model: BodyModel,
     target: Target,
     tracked: TrackedPoints,
     probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
@@ -176,9 +178,15 @@ def data_terms(
     probes, found = probed.result()
     place = np.concatenate([mine, probes])
     point = np.concatenate([subset[paired], found])
-    on_body, camera = skin.positions[place], target.camera[point]
+    camera = target.camera[point]
     on_cloud = cameras.apply(cloud.points[point], camera)
-    direction = skin.normals[place]
+    if annealing.coarse:
+        on_body, direction = skin.positions[place], skin.normals[place]
+    else:
+        # A vertex pulled along its own normal towards the points around it sinks into a curved
+        # skin: by a millimetre and more, on all sides.
+        places = attached(model, skin.positions, on_cloud, place)
+        on_body, direction = places.of(skin.positions, model.faces), cloud.normals[point]
     rows = [_point_rows(place, direction, on_cloud - on_body, target.sigma_m[point], annealing)]
     camera_terms = None
     if not annealing.coarse:

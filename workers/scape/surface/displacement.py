@@ -53,10 +53,11 @@ _ROUNDS = (
     _Round(0.020, np.radians(45), 4.0, 3e-2),
     _Round(0.012, np.radians(40), 1.0, 1e-2),
 )
-_SIGMA_PER_MISMATCH = 2.5
-"""Standard deviation of the offsets per rms distance of the points from the model's surface. More
-than 1, since folds and edges are steeper than a field of one range: errors on real people hardly
-change between 1.5 and 5."""
+_SIGMA_PER_MISMATCH = 4.0
+"""Standard deviation of the offsets per mismatch of the points and the model's surface, without the
+points' noise. More than 1, since folds and edges are steeper than a field of one range."""
+_NOISE_LEFT = 0.8
+"""Standard deviation of the mean of a vertex's points per that of a point: they share most."""
 _MIN_SIGMA_M = 0.0008
 """Floor of the offsets' standard deviation: what the components leave out of the model's own
 bodies."""
@@ -89,28 +90,26 @@ class SurfaceFit:
 
 @dataclass(frozen=True, slots=True)
 class _Readings:
-    """Points of the cloud, and after them the rims, which follow the surface."""
+    """Points of the cloud, which follow the surface."""
 
     points: Array
     directions: Array
     information: Array
     """(n,): inverse variance, times the share that is independent."""
-    of_cloud: int
-    """Number of points of the cloud. A rim says where the skin ends, not that a camera saw it."""
+    noise_m: float
+    """Rms of the standard deviations of the cloud's points."""
     tracked: TrackedPoints
 
     @classmethod
-    def build(cls, model: BodyModel, cloud: PointCloud, rims: PointCloud) -> _Readings:
-        """An even subset of the cloud, and all rims."""
+    def build(cls, model: BodyModel, cloud: PointCloud) -> _Readings:
+        """An even subset of the cloud."""
         every = slice(None, None, -(-len(cloud.points) // _MAX_POINTS))
-        points = np.concatenate([cloud.points[every], rims.points])
-        directions = np.concatenate([cloud.normals[every], rims.normals])
-        noise = np.concatenate([cloud.sigma_m[every], rims.sigma_m])
+        points, directions, noise = cloud.points[every], cloud.normals[every], cloud.sigma_m[every]
         return cls(
             points,
             directions,
             _INDEPENDENT / np.maximum(noise, _MIN_NOISE_M) ** 2,
-            len(points) - len(rims),
+            float(np.sqrt(np.mean(noise**2))),
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
 
@@ -129,11 +128,10 @@ class _Readings:
         return np.asarray(np.einsum("ni,ni->n", self.directions[used], offsets))
 
     def at_vertices(self, used: Index, vertex: Index, away_m: Array, count: int) -> _AtVertices:
-        """Means at the vertices (count,) over the cloud's among some readings."""
-        seen = used < self.of_cloud
-        vertex, information = vertex[seen], self.information[used[seen]]
+        """Means at the vertices (count,) over some readings."""
+        information = self.information[used]
         total: Array = np.bincount(vertex, information, count).astype(np.float64)
-        pull: Array = np.bincount(vertex, information * away_m[seen], count).astype(np.float64)
+        pull: Array = np.bincount(vertex, information * away_m, count).astype(np.float64)
         return _AtVertices(pull / np.where(total > 0.0, total, 1.0), total)
 
 
@@ -161,18 +159,16 @@ def fit_surface(
     model: BodyModel,
     vertices: Array,
     cloud: PointCloud,
-    rims: PointCloud,
     crown: Callable[[Array], Rows],
 ) -> SurfaceFit:
-    """Fit the model's surface to a cloud, to the rims of the hands and to the top of the head.
+    """Fit the model's surface to a cloud and to the top of the head.
 
     Args:
         vertices: (P, 3), the model's surface.
-        rims: outlines of the hands, where the cloud ends.
         crown: rows for the top of the head, a function of the current vertices. There are no points
             there, so the smooth field alone would carry on the trend of the points around it.
     """
-    readings = _Readings.build(model, cloud, rims)
+    readings = _Readings.build(model, cloud)
     prior = offset_prior(model)
     offset = np.zeros_like(vertices)
     before: _AtVertices | None = None
@@ -183,7 +179,8 @@ def fit_surface(
         away = readings.away_m(used, places.of(vertices, model.faces))
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
-        sigma_m = max(_SIGMA_PER_MISMATCH * before.rms_m, _MIN_SIGMA_M)
+            mismatch_square = before.rms_m**2 - (_NOISE_LEFT * readings.noise_m) ** 2
+        sigma_m = max(_SIGMA_PER_MISMATCH * np.sqrt(max(mismatch_square, 0.0)), _MIN_SIGMA_M)
         rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
         rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
         sigma_m /= np.sqrt(round_.stiffness)
@@ -206,7 +203,7 @@ def _examined(
     after = readings.at_vertices(used, vertex, away, len(vertices))
     # The template is finer than the pixels: a vertex between others that have points is seen too.
     seen = after.observed | (model.adjacency @ after.information > 0.0)
-    on_surface = (used < readings.of_cloud) & (np.abs(away) < _ON_SURFACE_M)
+    on_surface = np.abs(away) < _ON_SURFACE_M
     measured = np.zeros(len(vertices), bool)
     measured[model.faces[places.triangle[on_surface]]] = True
     return SurfaceFit(

@@ -11,8 +11,6 @@ readings on it stays where it is as long as the rest can give way.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -20,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, area_vectors, vertex_normals
+from workers.scape.surface.contacts import grown, neighbour_mean, parted
 from workers.scape.surface.crossings import crossing_pairs
 
 Array = NDArray[np.float64]
@@ -74,8 +73,10 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
             crossings remain otherwise.
     """
     faces = model.faces
-    mean = _neighbour_mean(model)
-    current = early = vertices
+    mean = neighbour_mean(model)
+    current = early = parted(model, vertices, measured)
+    # What was parted keeps its offset from a model that was parted as well.
+    relaxed_to = reference + (current - vertices)
     trouble = np.zeros(len(vertices), np.int64)
     tested: Mask = np.ones(len(faces), bool)
     given_up: Mask = np.zeros(len(faces), bool)
@@ -92,11 +93,11 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
             break
         corners = np.zeros(len(vertices), bool)
         corners[faces[bad]] = True
-        marked = _grown(corners, mean, 1)
+        marked = grown(corners, mean, 1)
         trouble += marked
-        around = _grown(marked, mean, 1 + round_ // _ROUNDS_PER_RING)
+        around = grown(marked, mean, 1 + round_ // _ROUNDS_PER_RING)
         patch, yielding = np.flatnonzero(around & ~held), np.flatnonzero(corners & held)
-        relaxed = _relaxed(current, reference, patch, trouble[patch] > _OFFSET_ROUNDS, mean)
+        relaxed = _relaxed(current, relaxed_to, patch, trouble[patch] > _OFFSET_ROUNDS, mean)
         relaxed[yielding] += _YIELDING * (mean[yielding] @ current - current[yielding])
         current = relaxed
         changed = np.zeros(len(vertices), bool)
@@ -120,7 +121,7 @@ def _in_large_patches(faces: Faces, bad: Mask, mean: sp.csr_matrix) -> Mask:
     """Mask (K,) of triangles in connected patches with many bad ones."""
     corners = np.zeros(mean.shape[0], bool)
     corners[faces[bad]] = True
-    around = np.flatnonzero(_grown(corners, mean, 1))
+    around = np.flatnonzero(grown(corners, mean, 1))
     _, place = connected_components(mean[around][:, around], directed=False)
     of_vertex = np.full(len(corners), -1)
     of_vertex[around] = place
@@ -153,17 +154,3 @@ def _relaxed(
     chosen = patch[flat]
     relaxed[chosen] = vertices[chosen] + _FLATTENING * (mean[chosen] @ vertices - vertices[chosen])
     return relaxed
-
-
-def _grown(mask: Mask, mean: sp.csr_matrix, rings: int) -> Mask:
-    """Mask (P,) with so many rings of neighbours added."""
-    for _ in range(rings):
-        mask = mask | (mean @ mask.astype(np.float64) > 0.0)
-    return mask
-
-
-@lru_cache(maxsize=2)
-def _neighbour_mean(model: BodyModel) -> sp.csr_matrix:
-    """Matrix (P, P) that replaces each value by the mean of its neighbours' values."""
-    linked = model.adjacency
-    return (sp.diags(1.0 / np.asarray(linked.sum(axis=1)).ravel()) @ linked).tocsr()

@@ -25,8 +25,8 @@ Mask = NDArray[np.bool_]
 
 _COMMON_SHARE = 0.2
 """Weight of the whole body's amplitude against that of fully seen surroundings."""
-_FAMILY_MISMATCH_M = 0.0014
-"""Mismatch of bodies of the model's own family (1.38 to 1.54 mm on validation bodies): noise of the
+_FAMILY_MISMATCH_M = 0.0013
+"""Mismatch of bodies of the model's own family (1.2 to 1.5 mm on validation bodies): noise of the
 readings and what the components leave out. People whom the model does not know show 2 to 3 mm."""
 _MAX_FURTHER_M = 0.0018
 """Largest further mismatch that counts, that of sculpted bodies (2.0 to 2.5 mm in all): the gains
