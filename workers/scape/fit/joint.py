@@ -43,6 +43,9 @@ Array32 = NDArray[np.float32]
 
 _THUMB_STIFFNESS = 3.0
 """A thumb has few points, which must not turn it into the palm."""
+_CAMERA_SHARE = 0.5
+"""Share of the rows' information that counts for the cameras: a body that the model cannot follow
+pulls many rows the same way, and would move cameras that stand right."""
 _MIN_WEIGHT, _WEIGHT_SLACK = 1e-12, 1e-9
 """Added to the diagonal of each sample's weight, absolute and as a share of its trace, so that
 weights of rank 1 and 2 have a Cholesky factor."""
@@ -143,7 +146,7 @@ def _step(
     body_only = np.arange(size)
     normal[body_only, body_only] += DAMPING * np.trace(normal) / size
     if terms.cameras is not None:
-        information = scipy.linalg.block_diag(*cameras.prior_information())
+        information = scipy.linalg.block_diag(*cameras.prior_information()) / _CAMERA_SHARE
         normal[size:, size:] = terms.cameras.normal + information
         gradient[size:] = terms.cameras.gradient - information @ cameras.xi.ravel()
         together = rows.T @ terms.cameras.cross.reshape(-1, extra).astype(np.float32)
@@ -168,4 +171,5 @@ def _evidence(
     solved = scipy.linalg.cho_solve(body, np.column_stack([cross, gradient[:size]]))
     information = terms.normal - cross.T @ solved[:, :-1]
     vector = terms.gradient - cross.T @ solved[:, -1] + information @ cameras.xi.ravel()
-    return CameraEvidence(0.5 * (information + information.T), vector)
+    symmetric = 0.5 * (information + information.T)
+    return CameraEvidence(_CAMERA_SHARE * symmetric, _CAMERA_SHARE * vector)
