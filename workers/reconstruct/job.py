@@ -168,16 +168,26 @@ def _measured(
     """Measurements as scanned, and in the standard standing pose."""
     with watch.step("measure"):
         sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
-        errors = ScanErrors(
-            crown_sigma_m=fit.crown_sigma_m, patch_sigma_m=patch_sigma_m(model, fit.patches)
-        )
-        if predicted is not None:
-            errors = replace(
-                errors,
-                height_sigma_m=predicted.height_sigma_m,
-                girth_sigma_m=predicted.girth_sigma_m,
-            )
+        errors = scan_errors(model, fit, predicted)
         return (
             measure_body(model, fit.vertices, sigma_m, seen, errors),
             measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors),
         )
+
+
+def scan_errors(
+    model: BodyModel, fit: OverlappingFit, predicted: PredictedError | None
+) -> ScanErrors:
+    """Errors that one scan adds to those of ordinary scans.
+
+    Args:
+        predicted: errors of the calibration; None if it does not say.
+    """
+    errors = ScanErrors(
+        crown_sigma_m=fit.crown_sigma_m, patch_sigma_m=patch_sigma_m(model, fit.patches)
+    )
+    if predicted is None:
+        return errors
+    return replace(
+        errors, height_sigma_m=predicted.height_sigma_m, girth_sigma_m=predicted.girth_sigma_m
+    )

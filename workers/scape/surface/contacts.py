@@ -53,7 +53,10 @@ def parted(model: BodyModel, vertices: Array, measured: Mask) -> Array:
     """
     current = vertices
     for holding in (_HOLDING_ROUNDS, 0):
-        current = _pushed(model, current, measured, holding)
+        pushed = _pushed(model, current, measured, holding)
+        if pushed is current:
+            break  # nothing crosses
+        current = pushed
     return current
 
 

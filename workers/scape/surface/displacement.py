@@ -180,11 +180,11 @@ def fit_surface(
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
             mismatch_square = before.rms_m**2 - (_NOISE_LEFT * readings.noise_m) ** 2
-        sigma_m = max(_SIGMA_PER_MISMATCH * np.sqrt(max(mismatch_square, 0.0)), _MIN_SIGMA_M)
+            sigma_m = max(_SIGMA_PER_MISMATCH * np.sqrt(max(mismatch_square, 0.0)), _MIN_SIGMA_M)
         rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
         rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
-        sigma_m /= np.sqrt(round_.stiffness)
-        offset = solved(model, prior, sigma_m, rows, offset, round_.tolerance)
+        of_round_m = sigma_m / np.sqrt(round_.stiffness)
+        offset = solved(model, prior, of_round_m, rows, offset, round_.tolerance)
     assert before is not None
     return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
 
