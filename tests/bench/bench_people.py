@@ -13,10 +13,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+from fit_cases import on_the_mark
 
 from station.calibration.drift.people import ENOUGH, Drift, Evidence, find_drift
 from station.core.bundle import read_bundle
-from station.simulation.scene import Mesh, default_rig
+from station.simulation.scene import default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import warm_up
@@ -38,8 +39,7 @@ def evidence(
     poses = database.sample_poses("test", _POOL, _SEED)
     for index in range(_POOL):
         body = database.vertices(shapes.take(np.array([index])), poses[index][None])[0]
-        middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
-        mesh = Mesh(body - (*middle[:2], 0.0), database.faces)
+        mesh = on_the_mark(body, database.faces)
         booth = SimulatedBooth(seed=first + index, moved_cameras=moved)
         with tempfile.TemporaryDirectory() as folder:
             scan = preprocess(read_bundle(render_bundle(mesh, Path(folder) / "scan", booth)))

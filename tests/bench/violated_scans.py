@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from fit_cases import on_the_mark
 from numpy.typing import NDArray
 from room import first_with_room
 from true_measurements import TrueBody
@@ -22,10 +23,9 @@ from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import MeasuredBody, measure_body
 from workers.measure.definitions import DEFINITIONS
-from workers.measure.intervals import ScanErrors
+from workers.reconstruct.job import scan_errors
 from workers.scape.fit.fit import fit_overlapping, separate_limbs, single_threaded_blas
 from workers.scape.fit.observer import unobserved
-from workers.scape.fit.unmatched import patch_sigma_m
 from workers.scape.learn.database import BodyDatabase, Shapes
 from workers.scape.model.body_model import BodyModel
 
@@ -91,13 +91,11 @@ def scan_rows(model: BodyModel, booth: SimulatedBooth, rig: Rig, folder: Path) -
     body = first_with_room(
         database.vertices(shapes)[0], _posed(database, shapes, poses), database.faces
     )
-    middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
-    body = body - (*middle[:2], 0.0)
-    mesh = Mesh(body, database.faces)
+    mesh = on_the_mark(body, database.faces)
     sound = replace(booth, bias_m=0.0, violations=frozenset())
     measured, status = _measured(model, mesh, booth, rig, folder / "found")
     true, _ = _measured(model, mesh, sound, booth.rig, folder / "true")
-    truth = TrueBody(model, body).values()
+    truth = TrueBody(model, mesh.vertices).values()
     names = tuple(row.name for row in measured.rows)
     return ScannedRows(
         names,
@@ -122,15 +120,7 @@ def _measured(
     with single_threaded_blas():
         fit = fit_overlapping(model, scan, "joint", lambda *_: None, unobserved)
         verdict = separate_limbs(model, fit, scan.findings, unobserved).verdict
-        errors = ScanErrors(
-            crown_sigma_m=fit.crown_sigma_m, patch_sigma_m=patch_sigma_m(model, fit.patches)
-        )
-        if rig.predicted is not None:
-            errors = replace(
-                errors,
-                height_sigma_m=rig.predicted.height_sigma_m,
-                girth_sigma_m=rig.predicted.girth_sigma_m,
-            )
+        errors = scan_errors(model, fit, rig.predicted)
         surface = fit.surface
         return measure_body(model, fit.vertices, surface.sigma_m, surface.seen, errors), str(
             verdict.status
