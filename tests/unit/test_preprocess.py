@@ -226,6 +226,21 @@ def test_a_chair_apart_is_no_second_person(tmp_path: Path) -> None:
     assert scan.cloud.points[:, 0].max() < body.vertices[:, 0].max() + 0.02
 
 
+def test_dark_briefs_do_not_cut_a_body_in_two(tmp_path: Path) -> None:
+    """They give no reading; only the larger half was kept, and the rest called unseen."""
+    body = load_mesh(BODIES / "ann.npz")
+    middle = body.vertices[body.faces].mean(axis=1)
+    briefs = (middle[:, 2] > 0.72) & (middle[:, 2] < 0.96) & (np.abs(middle[:, 0]) < 0.23)
+    booth = SimulatedBooth(seed=1, sway_m=0.0, clutter=chair((0.75, 0.45)))
+    dark = Mesh(body.vertices, body.faces, briefs)
+    scan = preprocess(read_bundle(render_bundle(dark, tmp_path / "briefs", booth, frames=3)))
+    low, high = scan.cloud.points.min(axis=0), scan.cloud.points.max(axis=0)
+    assert scan.findings == ()
+    assert low[2] < 0.1
+    assert high[2] > body.vertices[:, 2].max() - 0.05
+    assert high[0] < body.vertices[:, 0].max() + 0.02
+
+
 def test_a_raised_hand_is_no_second_head() -> None:
     rng = np.random.default_rng(0)
     trunk = rng.uniform((-0.2, -0.12, 0.0), (0.2, 0.12, 1.45), (20_000, 3))

@@ -43,6 +43,11 @@ _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 1.1
 """Another component with this share of the largest one's points and this height is a second person;
 a chair that stands apart is lower and is ignored."""
+_SAME_BODY_SHARE, _SAME_BODY_GAP_M = 0.3, 0.35
+"""A component with this share of its footprint above or below the body, at most so far from it, is
+of the same body: briefs and hair that give no reading cut one in two or three."""
+_LEAST_PART_SHARE = 0.005
+"""Components with a smaller share of the largest one's points are stray readings."""
 _PEOPLE_STRIDE = 4
 """Every so many points are used to count people."""
 _MOTION_M = 0.010
@@ -199,7 +204,7 @@ def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -
 
 
 def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
-    """Masks of the points of the largest connected component, and whether others are people."""
+    """Masks of the points of the largest body, and whether others are people."""
     everything = np.concatenate(points)
     if len(everything) < _MIN_POINTS:
         raise InputError(
@@ -218,12 +223,12 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
     main = int(np.argmax(sizes))
-    keep = of_point == main
+    same_body = _above_one_another(labels, sizes, main)
+    keep = same_body[of_point]
     beside = any(
         sizes[label] > _SECOND_PERSON_SHARE * sizes[main]
         and np.ptp(everything[of_point == label, 2]) > _SECOND_PERSON_HEIGHT_M
-        for label in range(1, count + 1)
-        if label != main
+        for label in np.flatnonzero(~same_body)
     )
     findings = []
     if beside or count_people(everything[np.flatnonzero(keep)[::_PEOPLE_STRIDE]]) > 1:
@@ -231,6 +236,25 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
         findings.append(Finding("two-people", None, None, message))
     ends = np.cumsum([len(part) for part in points])
     return np.split(keep, ends[:-1]), findings
+
+
+def _above_one_another(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: int) -> Mask:
+    """Which components (count + 1,) are of one body with the largest."""
+    same_body = np.zeros(len(sizes), bool)
+    same_body[main] = True
+    body = labels == main
+    for label in np.argsort(-sizes, kind="stable")[1:]:
+        if sizes[label] < _LEAST_PART_SHARE * sizes[main]:
+            break
+        part = labels == label
+        its, whole = (np.flatnonzero(one.any(axis=(0, 1))) for one in (part, body))
+        gap_m = _VOXEL_M * max(its[0] - whole[-1], whole[0] - its[-1])
+        footprint = part.any(axis=2)
+        shared = (footprint & body.any(axis=2)).sum()
+        if gap_m < _SAME_BODY_GAP_M and shared > _SAME_BODY_SHARE * footprint.sum():
+            same_body[label] = True
+            body |= part
+    return same_body
 
 
 def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
