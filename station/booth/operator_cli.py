@@ -305,9 +305,13 @@ def _show_result(path: str) -> None:
         return
     document = json.loads((folder / "measurements.json").read_text())
     click.echo("")
+    width = max(len(row["name"]) for row in document["measurements"])
     for row in document["measurements"]:
+        if row["value_m"] is None:
+            click.echo(f"  {row['name']:<{width}}    not measured")
+            continue
         low, high = row["interval95_m"]
         half_mm = 500 * (high - low)
-        click.echo(f"  {row['name']:<28} {100 * row['value_m']:7.1f} cm  ± {half_mm:.0f} mm")
+        click.echo(f"  {row['name']:<{width}} {100 * row['value_m']:7.1f} cm  ± {half_mm:.0f} mm")
     seconds = json.loads((folder / "result.json").read_text())["seconds"]
     click.echo("\n  " + "  ".join(f"{step} {value:.2f} s" for step, value in seconds.items()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,6 +154,8 @@ def row_errors(model: BodyModel, scans: Sequence[Scan]) -> dict[Pose, dict[str, 
             truth = scan.truth[pose]
             for trace in trace_all(model, vertices):
                 name = trace.definition.name
+                if math.isnan(trace.value_m):
+                    continue
                 errors, sigmas = found[pose].setdefault(sides_pooled(name), ([], []))
                 errors.append(trace.value_m - truth[name])
                 sigmas.append(line_sigma(trace, fit.vertex_sigma_m))

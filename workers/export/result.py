@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -54,7 +55,7 @@ def write_result(
         # Drawing releases the interpreter's lock, so it runs beside the other files.
         with ThreadPoolExecutor(1) as beside:
             missing = fit.verdict.missing_parts
-            rows = [row for row in measured.rows if not row.parts & missing]
+            rows = [row for row in measured.rows if not _is_blank(row, missing)]
             forward = -fit.state.rotations[0][:, 1]
             heading_rad = float(np.arctan2(forward[0], -forward[1]))
             texts = {**origin.to_json(), "verdict": fit.verdict.status}
@@ -84,13 +85,18 @@ def verdict_document(verdict: Verdict) -> dict[str, Any]:
     return {"status": verdict.status, "reasons": list(verdict.reasons)}
 
 
+def _is_blank(row: Measurement, missing: frozenset[str]) -> bool:
+    """Whether a row has no value: it lies on a missing part, or the body has no such line."""
+    return bool(row.parts & missing) or math.isnan(row.value_m)
+
+
 def measurements_document(
     origin: Origin, measured: MeasuredBody, verdict: Verdict | None = None
 ) -> dict[str, Any]:
     """measurements.json, format "booth-measurements", version 1.
 
     Rows are lengths; volume and surface, which have other units, stand beside them. Rows on parts
-    that are missing in the scan have no value.
+    that are missing in the scan, or that this body does not have, have no value.
 
     Args:
         verdict: None for a mesh that was not fitted to a scan.
@@ -101,7 +107,7 @@ def measurements_document(
         return {"value": found.value, "interval95": list(found.interval95)}
 
     def entry(row: Measurement) -> dict[str, Any]:
-        blank = bool(row.parts & missing)
+        blank = _is_blank(row, missing)
         return {
             "name": row.name,
             "standard": row.standard,
@@ -125,7 +131,7 @@ def measurements_document(
                 "value_m": found.value_m,
                 "interval95_m": list(found.interval95_m),
             }
-            for found in side_differences([r for r in measured.rows if not r.parts & missing])
+            for found in side_differences([r for r in measured.rows if not _is_blank(r, missing)])
         ],
         "volume_m3": content(measured.volume_m3),
         "surface_m2": content(measured.surface_m2),

@@ -29,6 +29,7 @@ class Measurement:
     name: str
     standard: str
     value_m: float
+    """NaN where the body has no such line."""
     interval95_m: tuple[float, float]
     path: Array
     """(n, 3) on the mesh as scanned, world frame, whatever the pose that the value is for."""
@@ -74,7 +75,7 @@ def measure_body(
         scan_errors: what concerns the whole scan.
 
     Raises:
-        InputError: a plane misses the part of the body that it should cut.
+        InputError: the planes of many rows miss the parts of the body that they should cut.
     """
     return _measured(
         model, vertices, vertices, "as-scanned", vertex_sigma_m, vertex_seen, scan_errors

@@ -241,10 +241,12 @@ def sides_pooled(name: str) -> str:
 
 
 def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
-    """Value (m) of each row, never negative."""
+    """Value (m) of each row, never negative; NaN where the body has no such line."""
     if pose == "as-scanned":
         return [trace.value_m for trace in traces]
-    return [max(0.0, trace.value_m - _model_of(trace, pose).bias) for trace in traces]
+    return [
+        float(np.maximum(0.0, trace.value_m - _model_of(trace, pose).bias)) for trace in traces
+    ]
 
 
 def intervals(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
+    NARROWEST_BREADTH,
     NARROWEST_TILTS_RAD,
     NORMAL_RADIUS,
     PROTRUSION_SHARE,
@@ -46,6 +48,8 @@ Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
 """Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
+_MOST_WITHOUT_LINE = 5
+"""Rows without a line from which it is no body that is measured. A chin on the chest hides one."""
 _MIN_LOOP = 8
 """Points of a section from which a piece may be a loop of skin."""
 
@@ -56,6 +60,7 @@ class Trace:
 
     definition: Definition
     value_m: float
+    """NaN where the body has no such line, whose points are then the row's landmarks."""
     points: EdgePoints
     closed: bool
     to_floor: bool
@@ -75,10 +80,17 @@ def trace_all(
     """The rows of a table on a body (P, 3), z up, floor at 0.
 
     Raises:
-        InputError: a plane misses the part of the body that it should cut.
+        InputError: the planes of many rows miss the parts of the body that they should cut.
     """
     tracer = _Tracer(model, vertices)
-    return [tracer.trace(definition) for definition in definitions]
+    traces = [tracer.trace(definition) for definition in definitions]
+    lost = [trace.definition.name for trace in traces if math.isnan(trace.value_m)]
+    if len(lost) > _MOST_WITHOUT_LINE:
+        raise InputError(
+            f"{', '.join(lost[:3])} and {len(lost) - 3} more rows cannot be measured on this "
+            "body; fit it again"
+        )
+    return traces
 
 
 @lru_cache(maxsize=64)
@@ -116,10 +128,9 @@ class _Tracer:
     def trace(self, definition: Definition) -> Trace:
         try:
             value, points, closed, to_floor = self._follow(definition)
-        except ValueError as cause:
-            raise InputError(
-                f"{definition.name} cannot be measured: {cause}; fit the body again"
-            ) from None
+        except ValueError:
+            marks = [self._model.landmarks[name] for name in definition.landmarks]
+            return Trace(definition, math.nan, EdgePoints.at(marks), False, False)
         return Trace(definition, value, points, closed, to_floor)
 
     def _follow(self, definition: Definition) -> tuple[float, EdgePoints, bool, bool]:
@@ -196,22 +207,26 @@ class _Tracer:
         ahead /= np.linalg.norm(ahead)
         up = np.cross(ahead, across)
         up /= np.linalg.norm(up)
-        middle = 0.5 * (self._at(plane.front) + self._at(plane.back))
+        front = self._at(plane.front)
+        middle = 0.5 * (front + self._at(plane.back))
         net = _net(self._model, section.parts)
-        tapes = []
+        tapes: list[tuple[float, float, _Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
-            found, crossing = net.cut(self._vertices, self._at(plane.front), normal)
+            found, crossing = net.cut(self._vertices, front, normal)
             places, piece = found.on(self._vertices), net.pieces(crossing)
             for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
                 if len(chosen) < _MIN_LOOP:
                     continue
                 tape = chosen[hull_order(places[chosen], normal)]
-                if encloses(places[tape], normal, middle):
-                    tapes.append(_Tape(found.take(tape), places[tape], normal))
-        if not tapes:
-            raise ValueError("no section goes around it")
-        return min(tapes, key=lambda tape: loop_length(tape.places, closed=True))
+                wide = np.ptp(places[tape] @ across) > NARROWEST_BREADTH * (across @ across)
+                if encloses(places[tape], normal, middle) and not wide:
+                    girth = loop_length(places[tape], closed=True)
+                    tapes.append((girth, tilt, _Tape(found.take(tape), places[tape], normal)))
+        _, tilt, least = min(tapes, key=lambda found: found[0], default=(0.0, math.inf, None))
+        if least is None or tilt == NARROWEST_TILTS_RAD[-1]:
+            raise ValueError("no section goes around it alone")
+        return least
 
     def _thickest(self, section: Section, plane: Thickest) -> _Tape:
         low, high = self._plane(plane.lower)[0], self._plane(plane.upper)[0]
