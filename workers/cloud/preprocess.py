@@ -239,7 +239,7 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
 
 
 def _above_one_another(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: int) -> Mask:
-    """Which components (count + 1,) are of one body with the largest."""
+    """Mask (count + 1,) of the components that are of one body with the largest."""
     same_body = np.zeros(len(sizes), bool)
     same_body[main] = True
     body = labels == main
