@@ -57,14 +57,17 @@ class OffsetRows:
 
 @dataclass(frozen=True, slots=True)
 class _Pattern:
-    """Blocks of the rows' matrix, in compressed rows."""
+    """Pairs of vertices that share an edge, and each vertex with itself, in compressed rows.
 
-    first: Index
+    Places are unsigned: the compiler then leaves out what makes a negative one count from the end.
+    """
+
+    first: NDArray[np.uint32]
     """(P + 1,)."""
-    columns: Index
+    columns: NDArray[np.uint32]
     """(b,)."""
     of_triangle: Index
-    """(K, 3, 3): the block of each pair of a triangle's corners."""
+    """(K, 3, 3): the pair of each two of a triangle's corners."""
 
 
 def solved(
@@ -90,11 +93,10 @@ def solved(
         rows.at.triangle, rows.at.weights, rows.direction, rows.residual_m, rows.weight,
         model.faces, pattern.of_triangle, len(pattern.columns), model.vertex_count,
     )  # fmt: skip
-    precision = prior.precision
     return np.asarray(
         _conjugate_gradients(
-            precision.indptr, precision.indices, precision.data, 1.0 / sigma_m**2,
-            pattern.first, pattern.columns, blocks, right, start, tolerance, _MAX_STEPS,
+            pattern.first, pattern.columns, prior.operator.data,
+            prior.tau_square(sigma_m) / prior.area_m2, blocks, right, start, tolerance, _MAX_STEPS,
         )
     )  # fmt: skip
 
@@ -108,8 +110,10 @@ def _pattern(model: BodyModel) -> _Pattern:
     )
     one = np.repeat(model.faces, 3, axis=1).ravel()
     other = np.tile(model.faces, (1, 3)).ravel()
-    block = np.asarray(numbered[one, other]).ravel().astype(np.int64) - 1
-    return _Pattern(linked.indptr, linked.indices, block.reshape(-1, 3, 3))
+    pair = np.asarray(numbered[one, other]).ravel().astype(np.int64) - 1
+    return _Pattern(
+        linked.indptr.astype(np.uint32), linked.indices.astype(np.uint32), pair.reshape(-1, 3, 3)
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -143,19 +147,14 @@ def _assembled(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @numba.njit(cache=True, nogil=True)
 def _conjugate_gradients(  # type: ignore[no-untyped-def]  # pragma: no cover
-    prior_first, prior_columns, prior_values, scale, first, columns, blocks, right, start,
-    tolerance, most,
-):  # fmt: skip
+    first, columns, operator, scale, blocks, right, start, tolerance, most
+):
     count = len(right)
-    inverse = _inverse_diagonal(
-        prior_first, prior_columns, prior_values, scale, first, columns, blocks
-    )
+    inverse = _inverse_diagonal(first, columns, operator, scale, blocks)
     found = start.copy()
     product, residual = np.empty((count, 3)), np.empty((count, 3))
     conditioned = np.empty((count, 3))
-    _multiply(
-        prior_first, prior_columns, prior_values, scale, first, columns, blocks, found, product
-    )
+    _multiply(first, columns, operator, scale, blocks, found, conditioned, product)
     enough = tolerance**2 * _precondition(inverse, right, conditioned)
     for v in range(count):
         for i in range(3):
@@ -165,10 +164,7 @@ def _conjugate_gradients(  # type: ignore[no-untyped-def]  # pragma: no cover
     for _ in range(most):
         if strength <= enough:
             break
-        _multiply(
-            prior_first, prior_columns, prior_values, scale, first, columns, blocks, direction,
-            product,
-        )  # fmt: skip
+        _multiply(first, columns, operator, scale, blocks, direction, conditioned, product)
         along = 0.0
         for v in range(count):
             for i in range(3):
@@ -189,16 +185,15 @@ def _conjugate_gradients(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @numba.njit(cache=True, nogil=True)
 def _inverse_diagonal(  # type: ignore[no-untyped-def]  # pragma: no cover
-    prior_first, prior_columns, prior_values, scale, first, columns, blocks
+    first, columns, operator, scale, blocks
 ):
     """(P, 6): inverses of the diagonal's symmetric 3 x 3 blocks, by their cofactors."""
     count = len(first) - 1
     inverse = np.empty((count, 6))
     for v in range(count):
         prior = 0.0
-        for index in range(prior_first[v], prior_first[v + 1]):
-            if prior_columns[index] == v:
-                prior = scale * prior_values[index]
+        for index in range(first[v], first[v + 1]):
+            prior += scale[columns[index]] * operator[index] ** 2
         for index in range(first[v], first[v + 1]):
             if columns[index] == v:
                 block = blocks[index]
@@ -230,21 +225,27 @@ def _precondition(inverse, values, out):  # type: ignore[no-untyped-def]  # prag
 
 @numba.njit(cache=True, nogil=True)
 def _multiply(  # type: ignore[no-untyped-def]  # pragma: no cover
-    prior_first, prior_columns, prior_values, scale, first, columns, blocks, values, out
+    first, columns, operator, scale, blocks, values, between, out
 ):
-    """The equations' matrix times values (P, 3)."""
+    """The equations' matrix times values (P, 3).
+
+    The prior's part is the operator (symmetric), a scale (P,) and the operator again: its product
+    has three times the entries.
+    """
     for v in range(len(values)):
         x, y, z = 0.0, 0.0, 0.0
-        for index in range(prior_first[v], prior_first[v + 1]):
-            other, factor = prior_columns[index], prior_values[index]
+        for index in range(first[v], first[v + 1]):
+            other, factor = columns[index], operator[index]
             x += factor * values[other, 0]
             y += factor * values[other, 1]
             z += factor * values[other, 2]
-        x, y, z = scale * x, scale * y, scale * z
+        between[v, 0], between[v, 1], between[v, 2] = scale[v] * x, scale[v] * y, scale[v] * z
+    for v in range(len(values)):
+        x, y, z = 0.0, 0.0, 0.0
         for index in range(first[v], first[v + 1]):
-            other, block = columns[index], blocks[index]
+            other, factor, block = columns[index], operator[index], blocks[index]
             a, b, c = values[other, 0], values[other, 1], values[other, 2]
-            x += block[0] * a + block[1] * b + block[2] * c
-            y += block[1] * a + block[3] * b + block[4] * c
-            z += block[2] * a + block[4] * b + block[5] * c
+            x += factor * between[other, 0] + block[0] * a + block[1] * b + block[2] * c
+            y += factor * between[other, 1] + block[1] * a + block[3] * b + block[4] * c
+            z += factor * between[other, 2] + block[2] * a + block[4] * b + block[5] * c
         out[v, 0], out[v, 1], out[v, 2] = x, y, z

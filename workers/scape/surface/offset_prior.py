@@ -41,8 +41,8 @@ _MIN_AREA_M2 = 1e-8
 class OffsetPrior:
     """The field on one template. P vertices."""
 
-    precision: sp.csr_matrix
-    """(P, P): Q for a standard deviation of 1 m, the same for each coordinate."""
+    operator: sp.csr_matrix
+    """(P, P): kappa^2 M + K, with an entry for each vertex and for each edge."""
     area_m2: Array
     """(P,): the diagonal of M."""
     edge_lengths: sp.csr_matrix
@@ -55,15 +55,23 @@ class OffsetPrior:
         """Assemble the precision on a template's mean body (P, 3)."""
         area = np.maximum(vertex_areas(vertices, faces), _MIN_AREA_M2)
         operator = (_KAPPA**2 * sp.diags(area) + _cotangent_laplacian(vertices, faces)).tocsr()
-        precision = (operator @ sp.diags(1.0 / area) @ operator).tocsr()
-        precision.sort_indices()
+        operator.sort_indices()
         entries = operator.tocoo()
         smoother = CholeskySolverD(
             len(vertices), entries.row, entries.col, entries.data, MatrixType.COO
         )
-        return cls(
-            precision / (4.0 * np.pi * _KAPPA**2), area, _edge_lengths(vertices, faces), smoother
-        )
+        return cls(operator, area, _edge_lengths(vertices, faces), smoother)
+
+    @staticmethod
+    def tau_square(sigma_m: float) -> float:
+        """tau^2 of a field with a standard deviation."""
+        return 1.0 / (4.0 * np.pi * _KAPPA**2 * sigma_m**2)
+
+    def precision(self, sigma_m: float) -> sp.csr_matrix:
+        """Q (P, P), the same for each coordinate."""
+        operator = self.operator
+        product = operator @ sp.diags(self.tau_square(sigma_m) / self.area_m2) @ operator
+        return sp.csr_matrix(product)
 
     def share_around(self, values: Array) -> Array:
         """(P,): means of values (P,) over the surroundings of each vertex, with the kernel
