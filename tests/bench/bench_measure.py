@@ -57,6 +57,11 @@ class Table:
     def error(self) -> Array:
         return self.value - self.truth
 
+    @property
+    def given(self) -> NDArray[np.bool_]:
+        """Values that are not blank."""
+        return ~np.isnan(self.value)
+
 
 def table_of(scans: Sequence[Scan], measured: Sequence[MeasuredBody], pose: Pose) -> Table:
     names = [row.name for row in measured[0].rows]
@@ -73,16 +78,17 @@ def print_errors(table: Table, pose: Pose) -> None:
     )
     missed = []
     for column, definition in enumerate(DEFINITIONS):
-        error = 1e3 * table.error[:, column]
+        given = table.given[:, column]
+        error = 1e3 * table.error[given, column]
         size = np.abs(error)
         doubt = 1.96 * error.std(ddof=1) / np.sqrt(len(error))
         limit = ISO_LIMIT_MM[definition.quantity]
         met = abs(error.mean()) + doubt <= limit
         if not met:
             missed.append(definition.name)
-        half = 500.0 * (table.high - table.low)[:, column].mean()
-        held = 100.0 * _held(table)[:, column].mean()
-        share = 0.1 * np.mean(size / table.truth[:, column])
+        half = 500.0 * (table.high - table.low)[given, column].mean()
+        held = 100.0 * _held(table)[given, column].mean()
+        share = 0.1 * np.mean(size / table.truth[given, column])
         print(
             f"{definition.name:<30}{error.mean():7.2f}{doubt:6.2f}{limit:6.0f} "
             f"{'met' if met else 'MISSED':<7}{size.mean():6.2f}{share:6.2f}"
@@ -113,24 +119,25 @@ UNLIKE = Bars((92.0, 100.0), 8.0, 3.0)
 
 
 def print_coverage(table: Table, pose: Pose, bars: Bars) -> None:
-    held = 100.0 * _held(table).mean()
-    median_mm = 500.0 * float(np.median(table.high - table.low))
+    held = 100.0 * _held(table)[table.given].mean()
+    median_mm = 500.0 * float(np.nanmedian(table.high - table.low))
     low, high = bars.held
     verdict = "met" if low <= held <= high else "MISSED"
     print(
         f"{pose}: 95 % intervals hold the truth in {held:.1f} % (bar {low:.0f} to {high:.0f}): "
-        f"{verdict}"
+        f"{verdict}; {(~table.given).sum()} of {table.given.size} rows blank"
     )
     verdict = "met" if median_mm <= bars.half_mm else "MISSED"
     print(f"  median half width {median_mm:.2f} mm (bar {bars.half_mm:g}): {verdict}")
     girths = [i for i, row in enumerate(DEFINITIONS) if row.quantity in ("girth", "large girth")]
-    error = 1e3 * float(np.abs(table.error[:, girths]).mean())
+    error = 1e3 * float(np.nanmean(np.abs(table.error[:, girths])))
     verdict = "met" if error <= bars.girth_mm else "MISSED"
     print(f"  mean absolute error of girths {error:.2f} mm (bar {bars.girth_mm:g}): {verdict}")
     for quantity in ISO_LIMIT_MM:
         chosen = [i for i, row in enumerate(DEFINITIONS) if row.quantity == quantity]
-        half = 500.0 * (table.high - table.low)[:, chosen]
-        within = 100.0 * _held(table)[:, chosen].mean()
+        given = table.given[:, chosen]
+        half = 500.0 * (table.high - table.low)[:, chosen][given]
+        within = 100.0 * _held(table)[:, chosen][given].mean()
         print(
             f"  {quantity:<12}{within:6.1f} %  half width median {np.median(half):5.2f} mm, "
             f"p5 {np.quantile(half, 0.05):5.2f}, p95 {np.quantile(half, 0.95):5.2f}"

@@ -188,3 +188,17 @@ def test_the_start_has_the_arms_where_the_cloud_has_them(
     for side in ("left", "right"):
         hand = model.part_of_vertex == model.part_names.index(f"hand_{side}")
         assert np.linalg.norm((best - vertices)[hand].mean(axis=0)) < 0.2
+
+
+def test_a_start_faces_the_other_way_for_toes_that_show_the_wrong_way(model: BodyModel) -> None:
+    """A body half a metre off the mark, of whose feet little was seen, was fitted from behind."""
+    state = posed(model, model.neutral_state(), (20.0, 75.0), (0.0, 0.0), np.radians(10.0))
+    vertices = model.vertices(state)
+    vertices[:, 2] -= vertices[:, 2].min()
+    scout = SampledBody.build(model, np.arange(0, model.vertex_count, 53))
+    cloud, _ = _skin_points(model, vertices, 800)
+    toes_behind = cloud * (1.0, -1.0, 1.0)
+    best = model.vertices(starting_states(model, scout, cloud, toes_behind)[1])
+    for side in ("left", "right"):
+        hand = model.part_of_vertex == model.part_names.index(f"hand_{side}")
+        assert np.linalg.norm((best - vertices)[hand].mean(axis=0)) < 0.3

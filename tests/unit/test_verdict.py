@@ -79,6 +79,35 @@ def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
     assert set(verdict.missing) == {"thigh_right", "shin_right", "foot_right"}
 
 
+def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> None:
+    """A forearm was 150 mm off: the points on a quarter of it were those of the elbow."""
+    names = ("upper_arm_left", "forearm_left", "hand_left")
+    parts = [
+        PartReport(name, share, 1e-3) for name, share in zip(names, (0.9, 0.3, 0.0), strict=True)
+    ]
+    sides = {"front": 0.9, "back": 0.9}
+    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    assert verdict.reasons == ("the cameras saw only 0 % of the left hand",)
+    assert set(verdict.missing) == {"forearm_left", "hand_left"}
+    # Readings beside the body are the missing limb's.
+    beside = {"": "338 cm2 of the scan do not belong to the person"}
+    verdict = judge(parts, sides, (), beside, 1.75, np.zeros(model.beta_count), {})
+    assert set(verdict.missing) == set(names)
+
+
+def test_two_limbs_that_do_not_match_leave_nothing_to_measure(model: BodyModel) -> None:
+    """A person who was fitted the wrong way round: only the feet lay beside the scan."""
+    parts = [PartReport(name, 0.9, 1e-3) for name in ("chest", "forearm_right", "foot_left")]
+    sides = {"front": 0.9, "back": 0.9}
+    feet = {
+        f"foot_{side}": f"the {side} foot does not match the scan" for side in ("left", "right")
+    }
+    for lost, everything in ((feet, True), ({"foot_left": feet["foot_left"]}, False)):
+        verdict = judge(parts, sides, (), lost, 1.75, np.zeros(model.beta_count), {})
+        assert ({"chest", "forearm_right"} <= set(verdict.missing)) == everything
+        assert "foot_left" in verdict.missing
+
+
 def test_folds_and_stray_readings_are_no_lost_limb(model: BodyModel) -> None:
     """A fold of 25 mm, 3 cm long and 1 cm wide, and readings scattered over the booth."""
     cloud = _scan_of(model, model.mean)

@@ -152,10 +152,16 @@ def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
     gain *= float(stdtrit(len(unlike.errors) - 1, 0.5 + 0.5 * COVERAGE))
     left = np.sqrt(np.maximum(ordinary - np.square(gain * family.sigmas), 0.0))
     constant = max(
-        float(np.quantile(left, COVERAGE)),
-        _MIN_CONSTANT * float(np.quantile(np.sqrt(ordinary), COVERAGE)),
+        _conformal_quantile(left), _MIN_CONSTANT * _conformal_quantile(np.sqrt(ordinary))
     )
     return ErrorModel(bias, constant, gain)
+
+
+def _conformal_quantile(sizes: Array) -> float:
+    """Bound that the next of n + 1 exchangeable errors keeps with the probability `COVERAGE` (Vovk,
+    Gammerman & Shafer 2005, section 2.2): that of the n sizes alone holds it less often."""
+    count = len(sizes)
+    return float(np.quantile(sizes, min(COVERAGE * (count + 1) / count, 1.0)))
 
 
 def _shrunk_mean(errors: Array) -> float:
@@ -244,9 +250,7 @@ def row_values(traces: Sequence[Trace], pose: Pose) -> list[float]:
     """Value (m) of each row, never negative; NaN where the body has no such line."""
     if pose == "as-scanned":
         return [trace.value_m for trace in traces]
-    return [
-        float(np.maximum(0.0, trace.value_m - _model_of(trace, pose).bias)) for trace in traces
-    ]
+    return [float(np.maximum(0.0, trace.value_m - _model_of(trace, pose).bias)) for trace in traces]
 
 
 def intervals(

@@ -96,10 +96,11 @@ def stature_beta(model: BodyModel, stature_m: float) -> Array:
 def starting_states(
     model: BodyModel, scout: SampledBody, points: Array, cloud: Array
 ) -> list[BodyState]:
-    """Starting states, best first.
+    """Starting states: the best, the one that faces the other way, and the others, best first.
 
     The search first finds the rough heading, then the heading with both arms at one angle, then the
-    angle of each arm, then their swing forward or back.
+    angle of each arm, then their swing forward or back. Toes that the cameras hardly see can show
+    the wrong way.
 
     Args:
         scout: a few vertices of the model.
@@ -133,7 +134,9 @@ def starting_states(
     swung = [(arms_deg, swing, heading) for swing in product(_SWINGS_DEG, _SWINGS_DEG)]
     more_costs, more_states = scored([one for one in swung if any(one[1])])
     costs, states = np.concatenate([costs, more_costs]), states + more_states
-    return [states[index] for index in np.argsort(costs, kind="stable")]
+    first, *others = [states[index] for index in np.argsort(costs, kind="stable")]
+    _, turned = scored([(arms_deg[::-1], straight, heading + 180.0)])
+    return [first, *turned, *others]
 
 
 def facing_deg(heading_deg: float, cloud: Array, stature_m: float) -> float:

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 _MIN_COVERAGE = 0.22
 """Least share of a part's area that cameras must have seen; four cameras see 0.5 to 0.9 of it."""
 _HALF_COVERAGE = 0.6
-"""Coverage below which a part cannot be measured when half the person is missing: of one half alone
-cameras see up to a half of it."""
+"""Coverage below which a part cannot be measured when half the person, or the part that follows, is
+missing: of one half alone cameras see up to a half of it."""
 _LIMBS = ("left", "right")
 _MIN_EXTREMITY_COVERAGE = 0.10
 """The same for hands, feet, shoulders and the neck, which hide behind other parts."""
@@ -211,7 +211,7 @@ def judge(
             missing.append(part.name)
             unseen.add(part.name)
     halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
-    missing = _with_rest_of_limbs(missing, lost)
+    missing = _with_rest_of_limbs(missing, lost, parts)
     if halved:
         missing += [
             part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
@@ -268,14 +268,25 @@ def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
     }
 
 
-def _with_rest_of_limbs(missing: Sequence[str], lost: Mapping[str, str]) -> list[str]:
-    """Missing parts, what is farther out, and the whole limb whose middle is somewhere else."""
+def _with_rest_of_limbs(
+    missing: Sequence[str], lost: Mapping[str, str], parts: Sequence[PartReport]
+) -> list[str]:
+    """Missing parts, what is farther out, and what is next to them and was hardly seen: nothing
+    says how it points. All of a limb where its middle, or something beside the body, does not match
+    the scan; all of the body where two limbs do not."""
+    coverage = {part.name: part.coverage for part in parts}
+    limbs = [[f"{part}_{side}" for part in chain] for chain in _CHAINS for side in _LIMBS]
+    owner = {part: limb[0] for limb in limbs for part in limb}
+    if len({owner.get(part, "trunk") for part in lost if part}) > 1:
+        return [*missing, *coverage]
     found = list(missing)
-    for chain in _CHAINS:
-        for side in _LIMBS:
-            limb = [f"{part}_{side}" for part in chain]
-            first = next((place for place, part in enumerate(limb) if part in missing), len(limb))
-            found += limb if limb[1] in lost else limb[first:]
+    for limb in limbs:
+        first = next((place for place, part in enumerate(limb) if part in missing), len(limb))
+        if first == len(limb):
+            continue
+        while first > 0 and coverage.get(limb[first - 1], 1.0) < _HALF_COVERAGE:
+            first -= 1
+        found += limb if limb[1] in lost or "" in lost else limb[first:]
     return found
 
 

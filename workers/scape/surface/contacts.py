@@ -65,7 +65,7 @@ def _pushed(model: BodyModel, vertices: Array, measured: Mask, holding: int) -> 
     many rounds."""
     yields = np.where(measured, 0.0, 1.0)
     arm, linked = _arms(model), neighbour_mean(model)
-    first = crossing = _contacts(model, vertices, arm, np.ones(len(model.faces), bool))
+    first = crossing = _contacts(model, vertices, arm, arm[model.faces[:, 0]] > 0)
     current = vertices
     for round_ in range(_ROUNDS):
         if not crossing.any():
