@@ -27,7 +27,7 @@ from drift_world import (
 from numpy.typing import NDArray
 from scipy.stats import beta, chi2
 
-from station.calibration.drift.alignment import estimate_move
+from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.motion import (
     LEVER_M,
     MOVED_M,
@@ -72,7 +72,7 @@ class Trial:
     @property
     def chi2(self) -> float:
         off = self.move.xi - self.true
-        return float(off @ np.linalg.solve(self.move.covariance, off))
+        return float(off @ np.linalg.solve(self.move.stated, off))
 
 
 def main() -> None:
@@ -121,10 +121,10 @@ def trials(
     }
     kind = list(_MOVES.values()).index(draw)
     for scan in range(scans):
-        scene = SCENES[scan % len(SCENES)]
+        scene = booth.scenes[scan % len(booth.scenes)]
         rng = np.random.default_rng((booth.seed, kind, scan, 25))
         visit = booth.visit(scene, 10_000 * kind + scan)
-        frames = CHECK_FRAMES if scene == "empty" else SCAN_FRAMES
+        frames = CHECK_FRAMES if "empty" in scene else SCAN_FRAMES
         for name, sensor in booth.sensors.items():
             true = draw(rng)
             taken = sensor.frames(visit, true, frames)
@@ -134,7 +134,7 @@ def trials(
 
 def _false_alarms(still: list[Trial], small: list[Trial]) -> None:
     print("\nNothing moved, or no farther than 2 mm and 0.15 degrees")
-    print(f"  {'':<14}{'views':>7}{'alarms':>8}{'nearest':>9}{'lost':>6}{'chi2/6, median':>16}")
+    print(f"  {'':<20}{'views':>7}{'alarms':>8}{'nearest':>9}{'lost':>6}{'chi2/6, median':>16}")
     for scene in SCENES:
         for name, group in (("still", still), ("small", small)):
             mine = [trial for trial in group if trial.scene == scene]
@@ -142,7 +142,7 @@ def _false_alarms(still: list[Trial], small: list[Trial]) -> None:
                 continue
             alarms = [trial.move.alarm() for trial in mine if not trial.move.lost]
             print(
-                f"  {scene + ', ' + name:<20}{len(mine):>5}{sum(t.move.moved for t in mine):>6}"
+                f"  {scene + ', ' + name:<25}{len(mine):>5}{sum(t.move.moved for t in mine):>6}"
                 f"{max(alarms):>9.2f}{sum(t.move.lost for t in mine):>6}"
                 f"{np.median([t.chi2 for t in mine]) / 6:>12.2f}"
             )
@@ -204,7 +204,7 @@ def _sizes(group: list[Trial]) -> None:
         errors = 1e3 * np.array([(t.move.xi - t.true) * SCALE for t in mine])
         known = 1e3 * np.array([_known_error(t) for t in mine])
         print(
-            f"  {scene:<12} inside their 99 % covariance: {100 * inside:.1f} %; rms error "
+            f"  {scene:<18} inside their 99 % covariance: {100 * inside:.1f} %; rms error "
             f"{_rms(errors[:, :3]) / 1e3 / LEVER_M * 180 / np.pi:.3f} deg, "
             f"{_rms(errors[:, 3:]):.2f} mm; of the components told: {_rms(known):.2f} mm"
         )
@@ -225,7 +225,7 @@ def _rms(values: Array) -> float:
 
 def _told(trial: Trial, xi: Array) -> Array:
     """Components of a move (6,) that are told, rotations times the lever."""
-    return CameraMove("", xi, trial.move.covariance, 1.0).known() * SCALE
+    return CameraMove("", xi, trial.move.stated, 1.0).known() * SCALE
 
 
 def _known_error(trial: Trial) -> Array:

@@ -2,7 +2,7 @@
 
 Nothing here is what `station.calibration.drift` assumes: sensors have a smooth bias, frozen noise,
 unknown lenses, a temperature of their own every day and silhouettes that lose their outermost
-pixels; people differ from scan to scan, sway, bring bags, move chairs and lean against walls.
+pixels; people differ from scan to scan, sway, bring bags, move chairs and curtains, hang up coats.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from station.simulation.scene import (
     chair,
     default_rig,
     fixed_posts,
+    sphere,
 )
 from station.simulation.sensor import SimulatedBooth, SimulatedUnit
 from workers.scape.model.body_model import BodyState, load_model
@@ -37,10 +38,17 @@ from workers.scape.model.body_model import BodyState, load_model
 Array = NDArray[np.float64]
 Depth = NDArray[np.uint16]
 Room = Literal["posts", "bare", "furnished", "one wall"]
-Scene = Literal["empty", "person", "bag", "chair moved", "helper"]
+Scene = Literal[
+    "empty", "person", "bag", "helper", "chair moved", "chair moved, empty", "chair added",
+    "chair removed", "curtain moved", "coat hung",
+]  # fmt: skip
 
 ROOMS: tuple[Room, ...] = ("posts", "bare", "furnished")
-SCENES: tuple[Scene, ...] = ("person", "bag", "chair moved", "helper", "empty")
+SCENES: tuple[Scene, ...] = (
+    "person", "bag", "chair moved", "helper", "empty", "chair added", "chair removed",
+    "curtain moved", "coat hung", "chair moved, empty",
+)  # fmt: skip
+_FURNISHED = ("chair moved", "chair moved, empty", "chair removed", "curtain moved")
 STORED_FRAMES, SCAN_FRAMES, CHECK_FRAMES = 45, 10, 30
 
 _RIG_TURN_RAD, _RIG_SHIFT_M = float(np.radians(3.0)), 0.05
@@ -53,8 +61,13 @@ _MOST_ERODED_PX = 2
 _ANOTHER_DAY = 0.3
 """Chance that a silhouette loses another number of pixels than when the booth was calibrated."""
 _SWAY_M = 0.003
+_NUDGE_M = 0.02
 _HOLE = np.ones((5, 5), np.uint8)
 _CHAIR_M = (0.75, 0.45)
+_CURTAIN_X_M = (-1.5, 1.5)
+"""A curtain hangs somewhere along the wall behind the person, another along that in front."""
+_COAT_M = (0.2, 0.08, 0.45)
+"""Half its width, depth and height."""
 _SEES = 0.3
 """Share of readings in the image of a camera that somebody would mount so."""
 
@@ -104,7 +117,8 @@ class DriftBooth:
         cameras = {name: _mounted(camera, rng) for name, camera in rig.cameras.items()}
         self._chair_turn = rng.uniform(0.0, 2.0 * np.pi)
         self._fixed = _fixtures(room)
-        empty = VirtualScene([*self._fixed, *self._chair(0.0, 0.0)])
+        self._curtains_m = np.random.default_rng((seed, 26)).uniform(*_CURTAIN_X_M, 2)
+        empty = VirtualScene([*self._fixed, *self._chair(0.0, 0.0), *self._curtains(0.0)])
         self.sensors: dict[str, DriftSensor] = {}
         for name, camera in rig.cameras.items():
             while True:
@@ -115,37 +129,76 @@ class DriftBooth:
                 cameras[name] = _mounted(camera, rng)
             self.sensors[name] = sensor
 
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """Those that the room has the furniture for."""
+        if self.room == "furnished":
+            return SCENES
+        return tuple(scene for scene in SCENES if scene not in _FURNISHED)
+
     def visit(self, kind: Scene, seed: int) -> Visit:
         """One scan's scene."""
         rng = np.random.default_rng((self.seed, seed, 22))
-        things, people, offset = list(self._fixed), [], np.zeros(2)
-        if kind != "empty":
+        things, people = list(self._fixed), []
+        if "empty" not in kind:
             people.append(random_body(rng))
         if kind == "bag":
             angle, away = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.5)
             bag = box((-0.2, -0.12, 0.0), (0.2, 0.12, rng.uniform(0.25, 0.5)))
             x, y = away * np.cos(angle), away * np.sin(angle)
             things.append(placed(bag, x, y, rng.uniform(0.0, np.pi)))
-        if kind == "chair moved":
-            angle = rng.uniform(0.0, 2.0 * np.pi)
-            # From a nudge, which looks like a moved camera, to another place.
-            offset = 0.02 * 30.0 ** rng.random() * np.array([np.cos(angle), np.sin(angle)])
         if kind == "helper":
             side = rng.choice([-1.0, 1.0])
             where = (side * rng.uniform(1.1, 1.8), rng.uniform(-0.9, 0.9))
             people.append(placed(random_body(rng), *where, rng.uniform(0.0, 2.0 * np.pi)))
-        things.extend(self._chair(*offset))
+        things.extend(self._furniture(kind, rng))
         leans = _SWAY_M * rng.uniform(-1.0, 1.0, 2) if people else np.zeros(1)
         moments = [
             VirtualScene([*things, *(leaning(person, lean) for person in people)]) for lean in leans
         ]
         return Visit(kind, tuple(moments), seed)
 
+    def _furniture(self, kind: Scene, rng: np.random.Generator) -> list[Mesh]:
+        """Furniture after a change: from a nudge, which looks like a moved camera, to another
+        place."""
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        by = _NUDGE_M * 30.0 ** rng.random() * np.array([np.cos(angle), np.sin(angle)])
+        things = [] if kind == "chair removed" else self._chair(*(by * ("chair moved" in kind)))
+        things += self._curtains(float(by[0]) if kind == "curtain moved" else 0.0)
+        if kind == "chair added":
+            x, y = rng.choice([-1.0, 1.0], 2) * rng.uniform((0.6, 0.5), (1.6, 1.3))
+            things += [placed(part, x, y, angle) for part in chair((0.0, 0.0))]
+        if kind == "coat hung":
+            side = rng.choice([-1.0, 1.0])
+            coat = sphere((0.0, 0.0, 0.0), 1.0)
+            hung = np.array([rng.uniform(-1.5, 1.5), side * 2.03, rng.uniform(1.0, 1.4)])
+            things.append(Mesh(coat.vertices * _COAT_M + hung, coat.faces))
+        return things
+
     def _chair(self, dx: float, dy: float) -> list[Mesh]:
         if self.room != "furnished":
             return []
         x, y = _CHAIR_M
         return [placed(part, x + dx, y + dy, self._chair_turn) for part in chair((0.0, 0.0))]
+
+    def _curtains(self, dx: float) -> list[Mesh]:
+        if self.room != "furnished":
+            return []
+        return [
+            _curtain(x + dx, side) for x, side in zip(self._curtains_m, (-1.0, 1.0), strict=True)
+        ]
+
+
+def _curtain(x: float, side: float) -> Mesh:
+    """Folds of cloth before the wall at y = 2.1 m times side."""
+    across = np.linspace(-0.35, 0.35, 57)
+    y = side * (2.03 + 0.03 * np.sin(2.0 * np.pi * across / 0.14))
+    low = np.stack([x + across, y, np.full_like(y, 0.1)], axis=1)
+    vertices = np.concatenate([low, low + np.array([0.0, 0.0, 2.0])])
+    left = np.arange(len(across) - 1)
+    up = left + len(across)
+    faces = np.concatenate([np.stack([left, left + 1, up], 1), np.stack([left + 1, up + 1, up], 1)])
+    return Mesh(vertices, faces.astype(np.int32))
 
 
 def _mounted(camera: CameraCalibration, rng: np.random.Generator) -> CameraCalibration:

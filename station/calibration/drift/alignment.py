@@ -9,14 +9,12 @@ it under priors, for the whole image and for each block of it, so that the covar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.scene import raw_inverse_depth, smoothed
 from station.calibration.drift.motion import LEVER_M, MIN_SHARE, CameraMove
 from station.calibration.drift.reference import COMMON, LOCAL, DriftReference
 from station.core.depth_image import Image
@@ -62,24 +60,30 @@ _HUBER, _TUKEY = 1.345, 4.685
 _SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
 
 
-def estimate_move(
-    reference: DriftReference, frames: Sequence[NDArray[np.uint16]], scale_m: float
-) -> CameraMove:
-    """Align frames (h, w) in units of scale_m, taken at one moment, with the stored background.
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """A camera's move, and which parts of the image say so."""
+
+    move: CameraMove
+    blocks: NDArray[np.intp]
+    """(n,) numbers of the reference's blocks."""
+    information: Array
+    """(n, 6 + COMMON, 6 + COMMON) of each block."""
+    rest: Array
+    """(6 + COMMON, 6 + COMMON), of the priors."""
+
+    def covariance_without(self, blocks: NDArray[np.intp]) -> Array:
+        """The move's covariance (6, 6), had these blocks not been seen."""
+        kept = self.information[~np.isin(self.blocks, blocks)].sum(axis=0)
+        return np.asarray(np.linalg.inv(kept + self.rest)[:6, :6]) + _unseen_errors(0.0)
+
+
+def align(reference: DriftReference, now: tuple[Image, Image], frames: int) -> Alignment:
+    """Align the smoothed images of some frames (see `smoothed`) with the stored background.
 
     Robust Gauss-Newton over xi, first over surfaces, then with outlines, which see
     only a few pixels far.
     """
-    inverse = [raw_inverse_depth(frame, scale_m) for frame in frames]
-    share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
-    mean = np.asarray(np.mean(inverse, axis=0), np.float32)
-    return aligned(reference, mean, np.asarray(share), len(frames))
-
-
-def aligned(reference: DriftReference, mean: Image, share: Image, frames: int) -> CameraMove:
-    """The camera's move from the mean inverse depth (h, w) of some frames, no reading counting as
-    0, and the share (h, w) of them that have a reading."""
-    now = smoothed(mean, share)
     name, xi = reference.camera.name, np.zeros(6)
     for samples, sigma_m in (
         (reference.usable & ~reference.outline, _COARSE_SIGMA_M),
@@ -88,11 +92,20 @@ def aligned(reference: DriftReference, mean: Image, share: Image, frames: int) -
         same = samples & ~_changed(reference, now, xi)
         met = float(same.sum() / max(1, samples.sum()))
         if met < MIN_SHARE:
-            return CameraMove(name, np.zeros(6), np.eye(6), met)
-        xi, covariance = _align(_Samples.of(reference, same, frames), now, xi, sigma_m)
+            nothing = np.zeros((0, 6 + COMMON, 6 + COMMON))
+            lost = CameraMove(name, np.zeros(6), np.eye(6), met)
+            return Alignment(lost, np.zeros(0, np.intp), nothing, np.eye(6 + COMMON))
+        chosen = _Samples.of(reference, same, frames)
+        xi, information, rest = _align(chosen, now, xi, sigma_m)
+    covariance = np.linalg.inv(information.sum(axis=0) + rest)[:6, :6]
     size = np.linalg.norm(CameraMove(name, xi, covariance, met).known() * _SCALE)
-    common = np.diag((_SYSTEMATIC_M**2 + (_RELATIVE * size) ** 2) / np.square(_SCALE))
-    return CameraMove(name, xi, covariance + common, met)
+    move = CameraMove(name, xi, covariance + _unseen_errors(float(size)), met)
+    return Alignment(move, chosen.blocks, information, rest)
+
+
+def _unseen_errors(size: float) -> Array:
+    """Covariance (6, 6) of errors that no sample shows, of a move of a size (turns times lever)."""
+    return np.diag((_SYSTEMATIC_M**2 + (_RELATIVE * size) ** 2) / np.square(_SCALE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +117,8 @@ class _Samples:
     """Flat indices into the reference's grid."""
     starts: NDArray[np.intp]
     """Index of each block's first sample."""
+    blocks: NDArray[np.intp]
+    """Number of each block."""
     sigma: Array
     design: Array
     """(n, 6 + COMMON + LOCAL): changes in units of sigma."""
@@ -119,7 +134,7 @@ class _Samples:
         columns = (reference.jacobian, reference.common, reference.local)
         design = np.concatenate([c.reshape(-1, c.shape[-1])[at] for c in columns], axis=1)
         starts = np.flatnonzero(np.diff(block, prepend=-1))
-        return cls(reference, at, starts, sigma, design / sigma[:, None])
+        return cls(reference, at, starts, block[starts], sigma, design / sigma[:, None])
 
     def off(self, now: tuple[Image, Image], xi: Array) -> tuple[Array, Mask]:
         """Differences in units of sigma, and which samples are inside the image."""
@@ -129,8 +144,9 @@ class _Samples:
 
 def _align(
     samples: _Samples, now: tuple[Image, Image], xi: Array, prior_sigma_m: float
-) -> tuple[Array, Array]:
-    """Robust Gauss-Newton: the move (6,) and its covariance (6, 6)."""
+) -> tuple[Array, Array, Array]:
+    """Robust Gauss-Newton: the move (6,), the blocks' information and the priors' (see
+    Alignment)."""
     prior = np.concatenate([np.square(_SCALE / prior_sigma_m), 1.0 / _COMMON_SIGMA**2])
     explained, wider = np.zeros(len(samples.at)), np.ones(len(samples.starts))
     for step in range(_STEPS):
@@ -143,13 +159,13 @@ def _align(
         square = np.square(own / _LOCAL_SIGMA).sum(axis=1)
         wider = np.maximum(1.0, (_FREEDOM + square) / (_FREEDOM + LOCAL))
         xi = xi + change
-    return xi, np.asarray(np.linalg.inv(information)[:6, :6])
+    return xi, information, np.diag(prior)
 
 
 def _solved(
     samples: _Samples, weights: Array, off: Array, xi: Array, prior: Array, local: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """One step: change of xi (6,), information (6 + COMMON, ...), what of off (n,) the
+    """One step: change of xi (6,), information (blocks, 6 + COMMON, ...), what of off (n,) the
     disturbances explain, and the local ones (blocks, LOCAL), which are eliminated block by block.
 
     Args:
@@ -158,18 +174,21 @@ def _solved(
     border = 6 + COMMON
     design, edges = samples.design, [*samples.starts, len(off)]
     weighted = design * weights[:, None]
-    information, gradient = np.diag(prior), np.zeros(border)
+    information, gradient = np.zeros((len(local), border, border)), np.zeros(border)
     gradient[:6] = -prior[:6] * xi
     eliminated = []
-    for start, end, known in zip(edges[:-1], edges[1:], local, strict=True):
+    for index, (start, end, known) in enumerate(zip(edges[:-1], edges[1:], local, strict=True)):
         mine = slice(start, end)
         normal, right = design[mine].T @ weighted[mine], weighted[mine].T @ off[mine]
         inner = normal[border:, border:] + np.diag(known)
         solved = np.linalg.solve(inner, np.column_stack([normal[border:, :border], right[border:]]))
-        information += normal[:border, :border] - normal[:border, border:] @ solved[:, :border]
+        information[index] = normal[:border, :border]
+        information[index] -= normal[:border, border:] @ solved[:, :border]
         gradient += right[:border] - normal[:border, border:] @ solved[:, border]
         eliminated.append(solved)
-    change: Array = np.asarray(np.linalg.solve(information, gradient), np.float64)
+    change: Array = np.asarray(
+        np.linalg.solve(information.sum(axis=0) + np.diag(prior), gradient), np.float64
+    )
     explained = design[:, 6:border] @ change[6:]
     owns = np.array([solved[:, border] - solved[:, :border] @ change for solved in eliminated])
     for start, end, own in zip(edges[:-1], edges[1:], owns, strict=True):

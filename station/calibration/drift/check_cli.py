@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from station.calibration.drift.alignment import estimate_move
+from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.motion import CameraMove, move_words
 from station.calibration.drift.reference import DriftReference
@@ -124,7 +124,7 @@ def _document(move: CameraMove) -> dict[str, object]:
         "lost": move.lost,
         "rotation_rad": move.xi[:3].tolist(),
         "translation_m": move.xi[3:].tolist(),
-        "sigma": np.sqrt(np.diag(move.covariance)).tolist(),
+        "sigma": np.sqrt(np.diag(move.stated)).tolist(),
         "background_share": move.share,
         "unseen": move.unseen_words(),
     }

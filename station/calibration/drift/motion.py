@@ -61,6 +61,8 @@ class CameraMove:
     """(6, 6) of xi; directions that the scene does not show have a large variance."""
     share: float
     """Share of the stored background that is still seen, within what a small move explains."""
+    sure: Array | None = None
+    """(6, 6) covariance that holds whatever one thing in view may mislead; None: the same."""
 
     @property
     def lost(self) -> bool:
@@ -72,13 +74,21 @@ class CameraMove:
         """It has to be calibrated again before the next scan."""
         return not self.lost and self.alarm() > 1.0
 
+    @property
+    def stated(self) -> Array:
+        """(6, 6) covariance of the size that is told."""
+        return self.covariance if self.sure is None else self.sure
+
     def alarm(self) -> float:
         """Distance from no move, and from the nearest within the tolerance, as a share of what
         alarms."""
+        from_still = float(np.sqrt(self.xi @ np.linalg.solve(self.covariance, self.xi)))
+        return min(self.beyond() / _CERTAINTY, from_still / _NOT_STILL)
+
+    def beyond(self) -> float:
+        """Standard deviations from the nearest move within the tolerance."""
         information = np.asarray(np.linalg.inv(self.covariance * np.outer(_SCALE, _SCALE)))
-        size = self.xi * _SCALE
-        from_still = float(np.sqrt(size @ information @ size))
-        return min(_beyond_tolerance(size, information) / _CERTAINTY, from_still / _NOT_STILL)
+        return _beyond_tolerance(self.xi * _SCALE, information)
 
     def unseen(self) -> list[Array]:
         """Unit directions (6,) of shifts and of turns along which a camera may move by MOVED_M or
@@ -120,7 +130,7 @@ class CameraMove:
 
     def known(self) -> Array:
         """The move (6,) without the components that this view does not determine."""
-        variances, directions = np.linalg.eigh(self.covariance * np.outer(_SCALE, _SCALE))
+        variances, directions = np.linalg.eigh(self.stated * np.outer(_SCALE, _SCALE))
         told = np.sqrt(np.maximum(variances, 0.0)) < _TOLD_SIGMA_M
         size = np.where(told, directions.T @ (self.xi * _SCALE), 0.0)
         return np.asarray(directions @ size / _SCALE)

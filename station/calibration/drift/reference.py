@@ -25,7 +25,7 @@ COMMON, LOCAL = 3, 4
 """Numbers of common and of local disturbances."""
 _STRIDE_PX = 8
 """Samples this far apart, after smoothing, are nearly independent."""
-_BLOCK = 10
+BLOCK = 10
 """Samples along a side of a block, over which local disturbances are shared: 80 px, the shortest
 waves of a sensor's bias."""
 _SLOPE_PX = 15.0
@@ -100,7 +100,7 @@ class DriftReference:
         visible = np.minimum(image[at] / inverse, 1.0)
         steepness = np.hypot(slope[..., 0], slope[..., 1])
         height, width = rows.shape
-        block = np.arange(height)[:, None] // _BLOCK * width + np.arange(width) // _BLOCK
+        block = np.arange(height)[:, None] // BLOCK * width + np.arange(width) // BLOCK
         step = cv2.dilate(with_gaps, reach) - cv2.erode(with_gaps, reach)
         gap = np.clip(nearest / np.maximum(step, 1e-3), 1.0, _DEEPEST)
         common, local = _disturbances(image[at], visible, outline[at], steep[at], gap[at])

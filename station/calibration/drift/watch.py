@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView
-from station.calibration.drift.alignment import estimate_move
+from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.store import CalibrationStore
