@@ -14,7 +14,7 @@ from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Ob
 from station.calibration.solve import solution as solution_module
 from station.calibration.solve.solution import Solution
 from station.core.errors import CalibrationError
-from station.core.geometry import invert, transform
+from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import Rig
 from station.simulation import violations
@@ -163,6 +163,32 @@ def test_what_spoils_it_is_refused_in_words(
         solved(procedure.booth.rig, fault.spoil(seen), fault.radius_m)
     assert fault.words in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_a_ball_taken_from_the_mark_too_soon_is_refused(
+    procedure: VirtualProcedure, seen: Observations
+) -> None:
+    """Each camera saw it there in fewer frames than tell whether it rested."""
+    short = [
+        [ball for ball in seen.mark if ball.camera == name][:3]
+        for name in procedure.booth.rig.cameras
+    ]
+    with pytest.raises(CalibrationError, match="no camera saw the ball rest on the mark; put it"):
+        solved(procedure.booth.rig, replace(seen, mark=[ball for own in short for ball in own]))
+
+
+def test_cameras_that_all_hang_low_are_refused() -> None:
+    """Nobody would know how well heights are measured: none of them sees a crown."""
+    booth = synthetic.booth(101)
+    cameras = dict(booth.rig.cameras)
+    for name in ("front", "back"):
+        beside = se3_exp((0.0, 0.0, 0.0, 0.9, 0.1, 0.0))
+        lower = cameras[f"{name}-lower"].world_from_camera @ beside
+        cameras[f"{name}-upper"] = replace(cameras[f"{name}-upper"], world_from_camera=lower)
+    low = replace(booth, rig=replace(booth.rig, cameras=cameras))
+    seen = synthetic.observations(VirtualProcedure(low), rate_hz=RATE_HZ)
+    with pytest.raises(CalibrationError, match=r"no camera sees 1\.75 m above the mark: turn a"):
+        solved(low.rig, seen)
 
 
 def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observations) -> None:
