@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -84,10 +82,7 @@ class EdgeNet:
 
     def pieces(self, crossing: Index) -> Index:
         """The connected piece of a section that each cut edge belongs to."""
-        count = len(crossing)
-        tails, heads = self.segments(crossing)
-        links = coo_matrix((np.ones(len(tails)), (tails, heads)), shape=(count, count))
-        return np.asarray(connected_components(links, directed=False)[1], np.intp)
+        return np.asarray(_connected(*self.segments(crossing), len(crossing)))
 
     def segments(self, crossing: Index) -> tuple[Index, Index]:
         """Pairs of cut edges, by their place in `crossing`, that one triangle joins."""
@@ -97,6 +92,24 @@ class EdgeNet:
         triangle, cut_edge = triangle[order], cut_edge[order]
         same = np.flatnonzero(triangle[1:] == triangle[:-1])
         return cut_edge[same], cut_edge[same + 1]
+
+
+@numba.njit(cache=True)
+def _connected(tails, heads, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The smallest of count places that each is linked to (union-find, paths halved)."""
+    root = np.arange(count)
+    for link in range(len(tails)):
+        a, b = tails[link], heads[link]
+        while root[a] != a:
+            root[a] = root[root[a]]
+            a = root[a]
+        while root[b] != b:
+            root[b] = root[root[b]]
+            b = root[b]
+        root[max(a, b)] = min(a, b)
+    for place in range(count):
+        root[place] = root[root[place]]
+    return root
 
 
 def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]:
