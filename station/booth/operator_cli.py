@@ -205,10 +205,13 @@ def scan(
     if not wait:
         return
     click.echo(session["path"])
-    _show_result(session["path"])
-    click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result")
-    if session["state"] == "rescan":
+    again = session["state"] == "rescan"
+    if again:
+        # Before any number, which nobody should then take down.
         click.echo(f"scan again: {session['reason']}", err=True)
+    show_result(session["path"])
+    click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result")
+    if again:
         sys.exit(_EXIT_RESCAN)
 
 
@@ -298,7 +301,8 @@ def _text(label: str) -> str:
     return "".join(letter if letter.isprintable() else " " for letter in text)[:MAX_LABEL_LENGTH]
 
 
-def _show_result(path: str) -> None:
+def show_result(path: str) -> None:
+    """Print a delivered result's table; a blank row as not measured."""
     folder = Path(path)
     if not path or not folder.is_dir():
         click.echo("  delivered; the result has been taken from the outbox")
