@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import synthetic_calibration as synthetic
 from calibrated_booths import normalised_square, pair_errors, solved
+from procedure_time import print_procedure
 
 from station.calibration.detect.detections import Observations
 from station.core.bundle import read_bundle
@@ -201,6 +202,7 @@ def main() -> None:
             )
     summary(rows, len(seeds))
     refusals()
+    print_procedure()
 
 
 if __name__ == "__main__":
