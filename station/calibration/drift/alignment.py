@@ -32,7 +32,7 @@ _CORRELATION = 2.5
 variances of their sums are this much larger."""
 _FLOOR_PER_M = 2e-5
 """Error that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
-_COMMON_SIGMA = np.array([5e-5, 1e-4, 1.0])
+_COMMON_SIGMA = np.array([5e-5, 1e-4, 1.0, 1.0])
 """Standard deviations of `DriftReference.common`: warmth changes the depth of a warm sensor by
 0.2 mm at 1.7 m, and a silhouette loses a pixel more on one day than on another."""
 _LOCAL_SIGMA = np.array([2e-4, 0.3, 0.3, 0.5])

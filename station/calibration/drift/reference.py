@@ -21,7 +21,7 @@ from station.core.rig import CameraCalibration
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-COMMON, LOCAL = 3, 4
+COMMON, LOCAL = 4, 4
 """Numbers of common and of local disturbances."""
 _STRIDE_PX = 8
 """Samples this far apart, after smoothing, are nearly independent."""
@@ -36,6 +36,8 @@ _EDGE_PER_M_PX = 0.008
 _GRADUAL, _SHARPER = 4.0, 2.0
 """An outline is steeper than the picture smoothed so many times wider by at least this factor;
 a floor that fades out at a grazing angle is not, and it does not move with the picture."""
+_NOTHING = 1.2
+"""Behind an outline is nothing, rather than another surface, up to this ratio of the same two."""
 _DEEPEST = 8.0
 """Largest ratio of the gap between an object and the wall to the step from one to the other."""
 _OFTEN = 0.4
@@ -72,7 +74,7 @@ class DriftReference:
     """(r, c): the steepest slope of the image around, 1/m per pixel."""
     common: Array
     """(r, c, COMMON): change of the image by a shift of all inverse depths (1/m), by their relative
-    gain, and by silhouettes that lose one pixel more."""
+    gain, and by silhouettes that lose one pixel more: against nothing, and against a surface."""
     local: Array
     """(r, c, LOCAL): change of the image by a shift of a block's inverse depths (1/m), by a shift
     of its outlines along the rows and the columns, and by their growth (pixels)."""
@@ -179,7 +181,9 @@ def _disturbances(
     right, down = np.moveaxis(np.where(outline[..., None], steep, 0.0).astype(np.float64), -1, 0)
     growth = -np.hypot(right, down) * gap
     surface = np.where(outline, 0.0, 1.0)
-    common = np.stack([np.where(outline, visible, 1.0), image.astype(np.float64), growth], -1)
+    alone = np.where(gap < _NOTHING, growth, 0.0)
+    shifted = np.where(outline, visible, 1.0)
+    common = np.stack([shifted, image.astype(np.float64), alone, growth - alone], -1)
     return common, np.stack([surface, right, down, growth], -1)
 
 
