@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from fit_cases import on_the_mark
+from room import first_with_room
 
 from station.calibration.drift.people import ENOUGH, Drift, Evidence, find_drift
 from station.core.bundle import read_bundle
@@ -32,57 +33,66 @@ _SEED, _POOL = 51, 96
 
 def evidence(
     model: BodyModel, moved: Mapping[str, tuple[float, float]], first: int
-) -> Iterator[Evidence]:
-    """Evidence of accepted scans, one person after another."""
+) -> Iterator[Evidence | None]:
+    """Evidence of one person's scan after another; None of those that are not accepted."""
     database = BodyDatabase()
     shapes = database.sample("test", _POOL, _SEED)
     poses = database.sample_poses("test", _POOL, _SEED)
     for index in range(_POOL):
-        body = database.vertices(shapes.take(np.array([index])), poses[index][None])[0]
-        mesh = on_the_mark(body, database.faces)
+        own = shapes.take(np.array([index]))
+        tried = (database.vertices(own, pose[None])[0] for pose in np.roll(poses, -index, axis=0))
+        neutral = database.vertices(own)[0]
+        mesh = on_the_mark(first_with_room(neutral, tried, database.faces), database.faces)
         booth = SimulatedBooth(seed=first + index, moved_cameras=moved)
         with tempfile.TemporaryDirectory() as folder:
             scan = preprocess(read_bundle(render_bundle(mesh, Path(folder) / "scan", booth)))
             with single_threaded_blas():
                 fit = fit_overlapping(model, scan, "joint", lambda *_: None, unobserved)
                 verdict = separate_limbs(model, fit, scan.findings, unobserved).verdict
-        if verdict.status == "ok" and fit.evidence is not None:
-            yield Evidence.from_json(
-                fit.evidence.document([view.calibration for view in scan.views], "2026")
-            )
+        if verdict.status != "ok" or fit.evidence is None:
+            yield None
+            continue
+        views = [view.calibration for view in scan.views]
+        yield Evidence.from_json(fit.evidence.document(views, "2026"))
 
 
 def after(
     model: BodyModel, moved: Mapping[str, tuple[float, float]], args: argparse.Namespace
-) -> Drift | None:
-    """Verdict after so many accepted scans."""
-    taken = []
+) -> tuple[Drift | None, int]:
+    """Verdict after so many accepted scans, and the number of those that were taken for them."""
+    taken: list[Evidence] = []
+    tried = 0
     for one in evidence(model, moved, args.first):
-        taken.append(one)
+        tried += 1
+        if one is not None:
+            taken.append(one)
         if len(taken) == args.scans:
             break
-    return find_drift(taken)
+    return find_drift(taken), tried
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=ENOUGH, help="accepted scans of each row")
     parser.add_argument("--first", type=int, default=9000, help="seed of the first scan")
-    parser.add_argument("--camera", action="append", choices=list(default_rig().cameras))
+    parser.add_argument(
+        "--camera", action="append", choices=["none", *default_rig().cameras], help="only these"
+    )
     args = parser.parse_args()
     model = warm_up()
     print(
-        f"{'moved':<14}{'named':<14}{'mm off':>8}{'deg off':>9}{'offered':>9}"
+        f"{'moved':<14}{'named':<14}{'mm off':>8}{'deg off':>9}{'offered':>9}{'tried':>7}"
         f"  after {args.scans} accepted scans"
     )
-    for camera in (None, *(args.camera or default_rig().cameras)):
-        drift = after(model, {} if camera is None else {camera: (SHIFT_M, TURN_RAD)}, args)
+    for chosen in args.camera or ("none", *default_rig().cameras):
+        camera = None if chosen == "none" else chosen
+        drift, tried = after(model, {} if camera is None else {camera: (SHIFT_M, TURN_RAD)}, args)
         named = None if drift is None else drift.camera
         offered = drift is not None and drift.confirmed
         verdict = "met" if named == camera and offered == (camera is not None) else "MISSED"
         print(
             f"{camera or 'none':<14}{named or 'none':<14}{_off(drift)}"
-            f"{'yes' if offered else 'no':>9}  {verdict}",
+            f"{'yes' if offered else 'no':>9}{tried:>7}  {verdict}",
             flush=True,
         )
 
