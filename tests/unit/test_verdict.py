@@ -95,6 +95,15 @@ def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> 
     assert set(verdict.missing) == set(names)
 
 
+def test_a_part_far_from_its_points_is_missing_in_a_bad_scan_alone(model: BodyModel) -> None:
+    """A second scan of a sound person with odd hands would show the same."""
+    sides = {"front": 0.9, "back": 0.9}
+    for coverage, missing in ((0.9, ()), (0.0, ("hand_right", "hand_left"))):
+        parts = [PartReport("hand_left", 0.3, 6.5e-3), PartReport("hand_right", coverage, 1e-3)]
+        verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+        assert set(verdict.missing) == set(missing)
+
+
 def test_two_limbs_that_do_not_match_leave_nothing_to_measure(model: BodyModel) -> None:
     """A person who was fitted the wrong way round: only the feet lay beside the scan."""
     parts = [PartReport(name, 0.9, 1e-3) for name in ("chest", "forearm_right", "foot_left")]

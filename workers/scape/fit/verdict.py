@@ -28,6 +28,9 @@ _MIN_EXTREMITY_COVERAGE = 0.10
 _LOST_PATCH_M2 = 0.0040
 """Least area of a patch of the scan farther than 15 mm from the surface that makes a scan unusable:
 lost limbs leave 66 to 205 cm^2, folds and hair of sound scans of real people up to 11 cm^2."""
+_MISMATCH_M = 0.005
+"""Rms distance of a part's points from which nothing is measured there if the scan is to be taken
+again anyhow: parts in their places have up to 4.2 mm, a third of those 5 cm off more than 5."""
 _PARTS_NAMED = 6
 """Parts that the reasons name at most."""
 _UNEXPLAINED_M = 0.03
@@ -210,6 +213,8 @@ def judge(
         if found:
             missing.append(part.name)
             unseen.add(part.name)
+    if reasons:
+        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
     halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
     missing = _with_rest_of_limbs(missing, lost, parts)
     if halved:
