@@ -74,7 +74,7 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
     """
     faces = model.faces
     mean = neighbour_mean(model)
-    current = early = parted(model, vertices, measured)
+    current = first = parted(model, vertices, measured)
     # What was parted keeps its offset from a model that was parted as well.
     relaxed_to = reference + (current - vertices)
     trouble = np.zeros(len(vertices), np.int64)
@@ -86,7 +86,6 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
             held, trouble = np.zeros_like(measured), np.zeros_like(trouble)
         bad = _bad(current, reference, faces, tested) & ~given_up
         if round_ == _OFFSET_ROUNDS:
-            early = current
             given_up = bad & _in_large_patches(faces, bad, mean)
             bad &= ~given_up
         if not bad.any():
@@ -105,9 +104,9 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
         tested = np.asarray(changed[faces].any(axis=1))
     else:
         bad = _bad(current, reference, faces, tested)
-    spoiled = np.linalg.norm(current - early, axis=1) > _DEEPEST_M
+    spoiled = np.linalg.norm(current - first, axis=1) > _DEEPEST_M
     spoiled[faces[bad | given_up]] = True
-    return _restored(current, early, np.flatnonzero(spoiled), mean)
+    return _restored(current, first, np.flatnonzero(spoiled), mean)
 
 
 def _bad(vertices: Array, reference: Array, faces: Faces, tested: Mask) -> Mask:
