@@ -160,7 +160,12 @@ class ScanWriter:
     def _write(self, collection: Collection) -> None:
         order, rig = collection.order, collection.rig
         if self._config.drift.refuse_scans:
-            self._refuse_moved_cameras(collection)
+            # Seconds where many cameras moved, in which no disk is waited for.
+            self._begun_s = None
+            try:
+                self._refuse_moved_cameras(collection)
+            finally:
+                self._begun_s = time.monotonic()
         spool = self._spool
         temporary = spool.temporary(order.scan_id)
         write_bundle(

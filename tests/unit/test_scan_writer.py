@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 import weakref
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from station.booth.collection import Collection, Order
 from station.booth.frameset import Frameset
 from station.booth.scan_writer import Ended, ScanWriter, Started
+from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
+from station.core.rig import CameraCalibration
 from station.core.scans import ScanId
 from station.messaging.intake import LiveFrame
 from station.messaging.messages import FrameHeader
@@ -41,6 +46,38 @@ def test_frames_of_a_finished_scan_leave_the_memory(one_camera: BoothConfig) -> 
             time.sleep(0.01)
         assert kept() is None
     finally:
+        writer.close()
+
+
+class _LongCheck(DriftWatch):
+    """A check for moved cameras that lasts until it is told to end."""
+
+    def __init__(self, store: CalibrationStore) -> None:
+        super().__init__(store)
+        self.begun, self.end = threading.Event(), threading.Event()
+
+    def moves(
+        self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
+    ) -> list[CameraMove]:
+        self.begun.set()
+        assert self.end.wait(20.0)
+        return super().moves(camera, frames, scale_m)
+
+
+def test_a_long_check_for_moved_cameras_is_no_slow_disk(one_camera: BoothConfig) -> None:
+    check = _LongCheck(CalibrationStore(one_camera.calibrate.folder, one_camera.calibration))
+    writer = ScanWriter(one_camera, check, logging.getLogger())
+    try:
+        depth = np.zeros((480, 640), np.uint16)
+        found = Frameset({"front-lower": LiveFrame(_HEADER, depth)}, 5.0, 0.0)
+        order = Order(ScanId("a"), "", 1e9)
+        writer.write(Collection(order, default_rig(), 1, 1e9, [found]))
+        assert check.begun.wait(20.0)
+        assert writer.stalled(time.monotonic() + 60.0) == ""
+        check.end.set()
+        assert _events(writer)
+    finally:
+        check.end.set()
         writer.close()
 
 
