@@ -67,12 +67,6 @@ class OffsetPrior:
         """tau^2 of a field with a standard deviation."""
         return 1.0 / (4.0 * np.pi * _KAPPA**2 * sigma_m**2)
 
-    def precision(self, sigma_m: float) -> sp.csr_matrix:
-        """Q (P, P), the same for each coordinate."""
-        operator = self.operator
-        product = operator @ sp.diags(self.tau_square(sigma_m) / self.area_m2) @ operator
-        return sp.csr_matrix(product)
-
     def share_around(self, values: Array) -> Array:
         """(P,): means of values (P,) over the surroundings of each vertex, with the kernel
         kappa^2 (kappa^2 M + K)^-1 M, whose weights sum to 1 and fall off over the range."""
