@@ -116,7 +116,7 @@ def _painted(
 def _pieces(path: Array, seen: NDArray[np.bool_]) -> list[Line]:
     """The stretches of a path that are seen."""
     pieces: list[Line] = []
-    for (x, _, z), visible, before in zip(path, seen, [False, *seen[:-1]], strict=True):
+    for (x, _, z), visible, before in zip(path, seen, [False, *seen][: len(seen)], strict=True):
         if not visible:
             continue
         if not before:

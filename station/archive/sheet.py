@@ -68,7 +68,7 @@ class _Entry:
     words: str
     names: tuple[str, ...]
     values: tuple[tuple[str, float | None, float], ...]
-    """(side, value, half of the interval); no value where the part is missing in the scan."""
+    """(side, value, half of the interval); no value where the row is blank."""
     difference: tuple[float, bool] | None
     """Left less right, and whether it is more than its interval."""
 
@@ -199,7 +199,7 @@ def _figure(canvas: Canvas, view: View, entries: Sequence[_Entry], x: float, sca
         pieces = [piece for name in entry.names for piece in view.lines[name]]
         hidden = not pieces
         if hidden:
-            pieces = [view.whole[name] for name in entry.names]
+            pieces = [view.whole[name] for name in entry.names if view.whole[name]]
         canvas.setDash(*([1.6, 1.6], 0) if hidden else ())
         for piece in pieces:
             path = canvas.beginPath()

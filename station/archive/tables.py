@@ -62,7 +62,7 @@ def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[
 
 def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any]:
     name = str(entry["name"])
-    # A part that is missing in the scan has rows without values.
+    # A part that is missing in the scan, or a line that the body lacks, has no value.
     known = entry["value_m"] is not None
     lengths_m = (entry["value_m"], *entry["interval95_m"]) if known else ()
     scaled = [round(PER_METRE[unit] * length, DIGITS[unit]) for length in lengths_m]

@@ -111,6 +111,25 @@ def test_the_sheet_has_the_whole_table_on_one_page(
     assert len(pypdf.PdfReader(io.BytesIO(chinese)).pages) == 1
 
 
+def test_the_sheet_of_a_body_without_a_neck_to_measure(
+    console: LiveConsole, scans: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    """A blank row has neither value nor line."""
+    spool = Spool(console.config.spool.folder)
+    scan = ScanIndex(spool).get(scans[0]["scan_id"])
+    assert scan is not None
+    folder = Path(shutil.copytree(spool.path("outbox", scan.scan_id), tmp_path / scan.scan_id))
+    for name in ("measurements.json", "measurements-standard.json"):
+        document = json.loads((folder / name).read_text())
+        for row in document["measurements"]:
+            if row["name"] == "neck_girth":
+                row |= {"value_m": None, "interval95_m": None, "basis": None, "path": []}
+        (folder / name).write_text(json.dumps(document))
+    for pose in ("as-scanned", "standard"):
+        text = pypdf.PdfReader(io.BytesIO(sheet_pdf(scan, folder, pose, "cm", "en"))).pages[0]
+        assert "Neck" in text.extract_text()
+
+
 def _sphere(radius_m: float) -> Surface:
     import open3d as o3d
 

@@ -16,7 +16,7 @@ from station.core.errors import InputError
 from station.core.kinect_v1 import RANDOM_SIGMA, STEP
 from station.core.lens import project, rays
 from station.core.rig import CameraCalibration, PredictedError
-from station.simulation.scene import Mesh, chair, default_rig, load_mesh
+from station.simulation.scene import Mesh, box, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
 from workers.cloud.people import count_people
@@ -239,6 +239,23 @@ def test_dark_briefs_do_not_cut_a_body_in_two(tmp_path: Path) -> None:
     assert low[2] < 0.1
     assert high[2] > body.vertices[:, 2].max() - 0.05
     assert high[0] < body.vertices[:, 0].max() + 0.02
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [((-0.1, -0.1, 1.93), (0.1, 0.1, 2.05)), ((0.38, -0.2, 0.0), (0.48, 0.05, 0.45))],
+    ids=["lamp above the head", "stool below the hand"],
+)
+def test_a_whole_body_is_not_added_to(
+    tmp_path: Path, low: tuple[float, float, float], high: tuple[float, float, float]
+) -> None:
+    body = load_mesh(BODIES / "ann.npz")
+    booth = SimulatedBooth(seed=1, sway_m=0.0, clutter=(box(low, high),))
+    scan = preprocess(read_bundle(render_bundle(body, tmp_path / "beside", booth, frames=3)))
+    assert scan.findings == ()
+    points = scan.cloud.points
+    inside = (points > np.array(low) - 0.01) & (points < np.array(high) + 0.01)
+    assert not inside.all(axis=1).any()
 
 
 def test_a_raised_hand_is_no_second_head() -> None:

@@ -43,10 +43,13 @@ _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 1.1
 """Another component with this share of the largest one's points and this height is a second person;
 a chair that stands apart is lower and is ignored."""
+_LEGS_BELOW_M, _HEAD_ABOVE_M = 0.4, 1.3
+"""A body that begins higher than the one, or ends lower than the other, above the lowest of all
+points, lacks its legs or its head."""
 _SAME_BODY_SHARE, _SAME_BODY_GAP_M = 0.3, 0.35
-"""A component with this share of its footprint above or below the body, at most so far from it, is
-of the same body: briefs and hair that give no reading cut one in two or three."""
-_LEAST_PART_SHARE = 0.005
+"""A component with this share of its footprint above or below such a body, at most so far from it,
+is of the same body: briefs that give no reading cut one in two or three."""
+_LEAST_PIECE_SHARE = 0.005
 """Components with a smaller share of the largest one's points are stray readings."""
 _PEOPLE_STRIDE = 4
 """Every so many points are used to count people."""
@@ -223,7 +226,7 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     sizes = np.bincount(of_point, minlength=count + 1)
     sizes[0] = 0
     main = int(np.argmax(sizes))
-    same_body = _above_one_another(labels, sizes, main)
+    same_body = _pieces_of_body(labels, sizes, main)
     keep = same_body[of_point]
     beside = any(
         sizes[label] > _SECOND_PERSON_SHARE * sizes[main]
@@ -238,22 +241,32 @@ def _one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     return np.split(keep, ends[:-1]), findings
 
 
-def _above_one_another(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: int) -> Mask:
-    """Mask (count + 1,) of the components that are of one body with the largest."""
+def _pieces_of_body(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: int) -> Mask:
+    """Mask (count + 1,) of the components that are of one body with the largest.
+
+    Only a body that does not reach from the floor to a head lacks something: whoever is whole may
+    have a stool below the arm and a lamp above the head.
+    """
     same_body = np.zeros(len(sizes), bool)
     same_body[main] = True
     body = labels == main
+    heights = np.flatnonzero(body.any(axis=(0, 1))) * _VOXEL_M
+    no_legs, no_head = heights[0] > _LEGS_BELOW_M, heights[-1] < _HEAD_ABOVE_M
     for label in np.argsort(-sizes, kind="stable")[1:]:
-        if sizes[label] < _LEAST_PART_SHARE * sizes[main]:
+        if sizes[label] < _LEAST_PIECE_SHARE * sizes[main] or not (no_legs or no_head):
             break
-        part = labels == label
-        its, whole = (np.flatnonzero(one.any(axis=(0, 1))) for one in (part, body))
-        gap_m = _VOXEL_M * max(its[0] - whole[-1], whole[0] - its[-1])
-        footprint = part.any(axis=2)
-        shared = (footprint & body.any(axis=2)).sum()
-        if gap_m < _SAME_BODY_GAP_M and shared > _SAME_BODY_SHARE * footprint.sum():
+        piece = labels == label
+        footprint = piece.any(axis=2)
+        shared = footprint & body.any(axis=2)
+        if shared.sum() <= _SAME_BODY_SHARE * footprint.sum():
+            continue
+        its, rest = (np.flatnonzero(one[shared].any(axis=0)) for one in (piece, body))
+        below_m, above_m = _VOXEL_M * (rest[0] - its[-1]), _VOXEL_M * (its[0] - rest[-1])
+        if (no_legs and 0.0 < below_m < _SAME_BODY_GAP_M) or (
+            no_head and 0.0 < above_m < _SAME_BODY_GAP_M
+        ):
             same_body[label] = True
-            body |= part
+            body |= piece
     return same_body
 
 

@@ -60,6 +60,12 @@ def _heights() -> tuple[Definition, ...]:
     )  # fmt: skip
 
 
+_NECK_FOOT = Route(
+    ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
+    ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25,
+)  # fmt: skip
+
+
 def _head_and_neck() -> tuple[Definition, ...]:
     return (
         Definition(
@@ -70,7 +76,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
         Definition(
             "neck_girth", "just below the larynx, perpendicular to the neck", "girth",
             Section(
-                Narrowest("neck_front", "neck_back", *_both("side_neck")),
+                Narrowest("neck_front", "neck_back", *_both("side_neck"), _NECK_FOOT),
                 ("head", *SHOULDERS),
             ),
             f"{CLOTHES} 5.3.2",
@@ -79,10 +85,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
             "neck_base_girth",
             "seventh neck vertebra, side of the neck, pit of the neck and around, over the skin",
             "girth",
-            Route(
-                ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-                ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25,
-            ),
+            _NECK_FOOT,
             f"{CLOTHES} 5.3.3",
         ),
     )  # fmt: skip

@@ -159,7 +159,8 @@ def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
 
 def _conformal_quantile(sizes: Array) -> float:
     """Bound that the next of n + 1 exchangeable errors keeps with the probability `COVERAGE` (Vovk,
-    Gammerman & Shafer 2005, section 2.2): that of the n sizes alone holds it less often."""
+    Gammerman & Shafer 2005, chapter 4): that of the n sizes alone holds it less often. The largest
+    where n < 19, which is not enough."""
     count = len(sizes)
     return float(np.quantile(sizes, min(COVERAGE * (count + 1) / count, 1.0)))
 

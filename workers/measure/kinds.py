@@ -111,15 +111,16 @@ class Narrowest:
 
     Of a section in several pieces, the one around the middle of `front` and `back` counts. The
     tilts are `NARROWEST_TILTS_RAD`, to the front where `side` is the right one of the two.
-    A section broader than `NARROWEST_BREADTH` of the distance of these two takes in the shoulders
-    and does not count. Where the last tilt is the best, or none goes around, the body has no such
-    line: a chin that rests on the chest leaves no neck to measure.
+    A section longer than `foot` takes in shoulders or chin and does not count. Where the first or
+    the last tilt is the best, or none goes around, the body has no such line.
     """
 
     front: str
     back: str
     side: str
     other_side: str
+    foot: Route
+    """Closed."""
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -149,8 +150,6 @@ THICKEST_LEVELS = 9
 NARROWEST_TILTS_RAD = tuple(math.radians(degrees) for degrees in range(-12, 73, 4))
 """Angles between a horizontal plane and those that `Narrowest` tries: necks lean by 19 degrees, by
 55 with a trunk that leans and a head that is bowed."""
-NARROWEST_BREADTH = 1.2
-"""Necks of 300 bodies have 0.67 to 0.99."""
 PROTRUSION_SHARE = 0.05
 """13 mm at the belly and 8 at the seat. With it the girth of the belly errs by 3.4 mm on sculpted
 bodies, with the farthest vertex alone by 15."""

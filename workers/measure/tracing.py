@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
-    NARROWEST_BREADTH,
     NARROWEST_TILTS_RAD,
     NORMAL_RADIUS,
     PROTRUSION_SHARE,
@@ -48,10 +47,12 @@ Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
 """Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
-_MOST_WITHOUT_LINE = 5
-"""Rows without a line from which it is no body that is measured. A chin on the chest hides one."""
 _MIN_LOOP = 8
 """Points of a section from which a piece may be a loop of skin."""
+
+
+class NoLineError(ValueError):
+    """The body, though sound, does not have the line of a row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +61,17 @@ class Trace:
 
     definition: Definition
     value_m: float
-    """NaN where the body has no such line, whose points are then the row's landmarks."""
+    """NaN where the body has no such line."""
     points: EdgePoints
+    """The row's landmarks where the body has no such line."""
     closed: bool
     to_floor: bool
     """Whether the line continues from its last point straight down to the floor."""
 
     def path(self, vertices: Array) -> Array:
-        """Line (n, 3) on a body (P, 3) of the same topology."""
+        """Line (n, 3) on a body (P, 3) of the same topology; empty where it has none."""
+        if math.isnan(self.value_m):
+            return np.empty((0, 3))
         found = self.points.on(vertices)
         if self.to_floor:
             found = np.concatenate([found, found[-1:] * (1.0, 1.0, 0.0)])
@@ -80,17 +84,12 @@ def trace_all(
     """The rows of a table on a body (P, 3), z up, floor at 0.
 
     Raises:
-        InputError: the planes of many rows miss the parts of the body that they should cut.
+        InputError: a place is not a number, or a plane misses the part that it should cut.
     """
+    if not np.isfinite(vertices).all():
+        raise InputError("the mesh holds values that are not numbers; fit the body again")
     tracer = _Tracer(model, vertices)
-    traces = [tracer.trace(definition) for definition in definitions]
-    lost = [trace.definition.name for trace in traces if math.isnan(trace.value_m)]
-    if len(lost) > _MOST_WITHOUT_LINE:
-        raise InputError(
-            f"{', '.join(lost[:3])} and {len(lost) - 3} more rows cannot be measured on this "
-            "body; fit it again"
-        )
-    return traces
+    return [tracer.trace(definition) for definition in definitions]
 
 
 @lru_cache(maxsize=64)
@@ -128,9 +127,13 @@ class _Tracer:
     def trace(self, definition: Definition) -> Trace:
         try:
             value, points, closed, to_floor = self._follow(definition)
-        except ValueError:
+        except NoLineError:
             marks = [self._model.landmarks[name] for name in definition.landmarks]
             return Trace(definition, math.nan, EdgePoints.at(marks), False, False)
+        except ValueError as cause:
+            raise InputError(
+                f"{definition.name} cannot be measured: {cause}; fit the body again"
+            ) from None
         return Trace(definition, value, points, closed, to_floor)
 
     def _follow(self, definition: Definition) -> tuple[float, EdgePoints, bool, bool]:
@@ -210,6 +213,7 @@ class _Tracer:
         front = self._at(plane.front)
         middle = 0.5 * (front + self._at(plane.back))
         net = _net(self._model, section.parts)
+        most_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
         tapes: list[tuple[float, float, _Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
@@ -218,14 +222,18 @@ class _Tracer:
             for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
                 if len(chosen) < _MIN_LOOP:
                     continue
-                tape = chosen[hull_order(places[chosen], normal)]
-                wide = np.ptp(places[tape] @ across) > NARROWEST_BREADTH * (across @ across)
-                if encloses(places[tape], normal, middle) and not wide:
-                    girth = loop_length(places[tape], closed=True)
-                    tapes.append((girth, tilt, _Tape(found.take(tape), places[tape], normal)))
-        _, tilt, least = min(tapes, key=lambda found: found[0], default=(0.0, math.inf, None))
-        if least is None or tilt == NARROWEST_TILTS_RAD[-1]:
-            raise ValueError("no section goes around it alone")
+                try:
+                    tape = chosen[hull_order(places[chosen], normal)]
+                except ValueError:
+                    continue  # all on a line
+                girth_m = loop_length(places[tape], closed=True)
+                if girth_m < most_m and encloses(places[tape], normal, middle):
+                    tapes.append((girth_m, tilt, _Tape(found.take(tape), places[tape], normal)))
+        if not tapes:
+            raise NoLineError("no section goes around it alone")
+        _, tilt, least = min(tapes, key=lambda found: found[0])
+        if tilt in (NARROWEST_TILTS_RAD[0], NARROWEST_TILTS_RAD[-1]):
+            raise NoLineError("it is narrowest at the steepest plane")
         return least
 
     def _thickest(self, section: Section, plane: Thickest) -> _Tape:

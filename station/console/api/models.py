@@ -136,7 +136,9 @@ class Row(BaseModel):
     name: str
     words: str
     side: Literal["", "left", "right"]
-    value: float | None = Field(description="null where the part is missing in the scan")
+    value: float | None = Field(
+        description="null where the part is missing in the scan, or the body has no such line"
+    )
     low: float | None = Field(description="lower end of the 95 % interval")
     high: float | None
     basis: Literal["", "seen", "partly", "inferred"] = Field(

@@ -213,14 +213,6 @@ def judge(
         if found:
             missing.append(part.name)
             unseen.add(part.name)
-    if reasons:
-        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
-    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
-    missing = _with_rest_of_limbs(missing, lost, parts)
-    if halved:
-        missing += [
-            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
-        ]
     noticed, unusable = _CAMERA_SHIFTS_M
     notes: list[str] = []
     for camera, shift in camera_shifts_m.items():
@@ -229,6 +221,14 @@ def judge(
                 f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
                 "run: station check"
             )
+    if reasons:
+        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
+    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
+    missing = _with_rest_of_limbs(missing, lost, parts)
+    if halved:
+        missing += [
+            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
+        ]
     return Verdict(
         "rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(dict.fromkeys(missing))
     )
@@ -281,8 +281,7 @@ def _with_rest_of_limbs(
     the scan; all of the body where two limbs do not."""
     coverage = {part.name: part.coverage for part in parts}
     limbs = [[f"{part}_{side}" for part in chain] for chain in _CHAINS for side in _LIMBS]
-    owner = {part: limb[0] for limb in limbs for part in limb}
-    if len({owner.get(part, "trunk") for part in lost if part}) > 1:
+    if sum(not lost.keys().isdisjoint(limb) for limb in limbs) > 1:
         return [*missing, *coverage]
     found = list(missing)
     for limb in limbs:

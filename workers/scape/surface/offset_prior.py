@@ -52,7 +52,7 @@ class OffsetPrior:
 
     @classmethod
     def build(cls, vertices: Array, faces: Faces) -> OffsetPrior:
-        """Assemble the precision on a template's mean body (P, 3)."""
+        """Assemble the operator on a template's mean body (P, 3)."""
         area = np.maximum(vertex_areas(vertices, faces), _MIN_AREA_M2)
         operator = (_KAPPA**2 * sp.diags(area) + _cotangent_laplacian(vertices, faces)).tocsr()
         operator.sort_indices()
