@@ -252,8 +252,10 @@ def _pieces_of_body(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: i
     body = labels == main
     heights = np.flatnonzero(body.any(axis=(0, 1))) * _VOXEL_M
     no_legs, no_head = heights[0] > _LEGS_BELOW_M, heights[-1] < _HEAD_ABOVE_M
+    if not (no_legs or no_head):
+        return same_body
     for label in np.argsort(-sizes, kind="stable")[1:]:
-        if sizes[label] < _LEAST_PIECE_SHARE * sizes[main] or not (no_legs or no_head):
+        if sizes[label] < _LEAST_PIECE_SHARE * sizes[main]:
             break
         piece = labels == label
         footprint = piece.any(axis=2)
