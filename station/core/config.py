@@ -100,7 +100,10 @@ class CalibrateConfig(Strict):
         description="the same of a girth",
     )
     countdown_s: float = Field(
-        default=8.0, ge=0.0, le=60.0, description="to walk into the booth, or out of it"
+        default=8.0,
+        ge=0.0,
+        le=60.0,
+        description="to walk into the booth, lay the ball down and step back; half for a walk",
     )
 
 

@@ -47,7 +47,7 @@ class VirtualProcedure:
     waving_s: float = 60.0
     front_m: float = 0.5
     """Distance of the ball in front of the mark when it rests there."""
-    board_at_m: tuple[float, ...] = (-0.6, -0.2, 0.2, 0.6)
+    board_at_m: tuple[float, ...] = (-0.6, 0.0, 0.6)
     """y of the board's middle at each of its places."""
     around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
     """x, y of the ball at each of its places on the floor around the mark."""
@@ -255,7 +255,7 @@ class _Waving:
             Capsule(hand + 0.03 * grip, elbow, 0.038),
             Capsule(elbow, shoulder, 0.05),
         ]
-        for spread in (-0.6, -0.2, 0.2, 0.6):
+        for spread in (-0.6, 0.0, 0.6):
             side = across * np.cos(spread) + np.cross(grip, across) * np.sin(spread)
             tip = 0.75 * grip + 0.66 * side
             parts.append(Capsule(hand, center_m + (radius_m + 0.006) * tip, 0.009))

@@ -24,7 +24,6 @@ from station.simulation.sensor import (
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error if a calibration is recorded."""
-_BOARD_AT_M = (-0.6, 0.0, 0.6)
 _PROCESSES = 2
 
 
@@ -79,7 +78,7 @@ def record_virtual(
         for name in booth.rig.cameras
     }
     if waving_s is not None:
-        procedure = VirtualProcedure(booth, waving_s=waving_s, board_at_m=_BOARD_AT_M)
+        procedure = VirtualProcedure(booth, waving_s=waving_s)
         for step in procedure.steps:
             for name in booth.rig.cameras:
                 folder = out_folder / PROCEDURE / step / name

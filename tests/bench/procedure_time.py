@@ -34,7 +34,7 @@ _WALK_S = 4.0
 """From the mark to the keyboard, 4 m; the way back is within the countdown."""
 _ANSWER_S = 2.0
 _FETCH_S = {"stand": 15.0, "board": 10.0}
-"""To put up the stand or to move the board, before Enter; the ball is laid in the countdown."""
+"""To put up the stand or to move the board; the ball is laid in the countdown."""
 
 
 class _NoFeed:
@@ -64,23 +64,30 @@ class Operator:
     def prompt(self, text: str, **_: object) -> float | str:
         """Enter before a step, or the height of a stand."""
         self.read(text)
-        if "Height" not in text:
+        if "Enter" in text:
             self.spent_s["walking to the keyboard"] += _WALK_S
             return ""
-        self.spent_s["answers"] += _ANSWER_S
         if not self.stands_m:
+            self.spent_s["answers"] += _ANSWER_S
             return 0.0
-        self.spent_s["stand and board"] += _FETCH_S["stand"]
+        self._fetch("stand")
         return self.stands_m.pop(0)
 
     def confirm(self, text: str, **_: object) -> bool:
-        """One more place of the board?"""
+        """Is the board there?"""
         self.read(text)
-        self.spent_s["answers"] += _ANSWER_S
         self.boards -= 1
         if self.boards >= 0:
-            self.spent_s["stand and board"] += _FETCH_S["board"]
+            self._fetch("board")
+        else:
+            self.spent_s["answers"] += _ANSWER_S
         return self.boards >= 0
+
+    def _fetch(self, what: str) -> None:
+        """Put it up, come back to the keyboard and say so."""
+        self.spent_s["stand and board"] += _FETCH_S[what]
+        self.spent_s["walking to the keyboard"] += _WALK_S
+        self.spent_s["answers"] += _ANSWER_S
 
     def wait(self, seconds: float) -> None:
         self.spent_s["countdowns"] += seconds
@@ -99,10 +106,12 @@ def procedure_seconds(*, extras: bool) -> dict[str, float]:
     procedure has, without which heights and depths are known less well."""
     virtual, wanted = VirtualProcedure(), CalibrateConfig()
     operator = Operator(
-        list(virtual.stand_m) if extras else [], len(virtual.board_at_m) if extras else 0
+        list(virtual.stand_m[::-1]) if extras else [], len(virtual.board_at_m) if extras else 0
     )
     rest_s = steps._RESTING_DETECTIONS / INDEPENDENT_HZ + steps._OTHERS_S
-    session = SimpleNamespace(done=lambda step: step == EMPTY, around_count=0, wall_count=0)
+    session = SimpleNamespace(
+        done=lambda step: step == EMPTY, around_count=0, stand_count=0, wall_count=0
+    )
     config = SimpleNamespace(calibrate=wanted, reference="")
     sessions = chain([None], repeat(session))
     with (

@@ -237,7 +237,7 @@ def test_the_height_of_a_stand_is_asked_for(page: Page, console: LiveConsole) ->
         task = client.get("/task").json()
     asks = {"kind": "calibrate", "running": True, "waits_for": "height", "error": "", "lines": []}
     question = (
-        "A ball on a stand of measured height on the mark makes heights more accurate. "
+        "Put the ball on a stand on the mark, best as high as a head, for more accurate heights. "
         "How high is its underside above the floor?"
     )
     told: list[Any] = []

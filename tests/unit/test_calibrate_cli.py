@@ -107,10 +107,12 @@ def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationSto
 
 def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     laid: list[tuple[str, str]] = []
-    monkeypatch.setattr(Procedure, "_lay", lambda _, step, where, __="": laid.append((step, where)))
+    monkeypatch.setattr(Procedure, "_lay", lambda _, step, title, __: laid.append((step, title)))
     done = _run(config, "stand", "--height", "1.7")
     assert done.exit_code == 0, done.output
-    assert laid == [("stand-1700", "on a stand on the mark, its underside 1.7 m above the floor")]
+    assert laid == [
+        ("stand-1700", "Ball on a stand on the mark, its underside 1.7 m above the floor")
+    ]
     in_cm = _run(config, "stand", "--height", "170")
     assert in_cm.exit_code == 2
     assert "0.3<=x<=2.2" in in_cm.output

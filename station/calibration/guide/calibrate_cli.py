@@ -174,7 +174,8 @@ def around(procedure: Procedure) -> None:
 def stand(procedure: Procedure, height_m: float) -> None:
     """Look at the ball on a stand of measured height on the mark: the scale of all heights.
 
-    Two heights are best: one that all cameras see, and one as high as a head.
+    One as high as a head makes heights accurate; one half as high shows whether it was measured
+    rightly.
 
     \b
     Examples:
@@ -187,7 +188,7 @@ def stand(procedure: Procedure, height_m: float) -> None:
 @calibrate.command("depth")
 @_options
 def depth(procedure: Procedure) -> None:
-    """Look at a flat board at several distances: each sensor's own depth error.
+    """Look at a flat board at three distances or more: each sensor's own depth error.
 
     \b
     Examples:

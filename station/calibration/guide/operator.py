@@ -22,24 +22,41 @@ class Guide:
 
     attended: bool
     countdown_s: float
+    """To walk into the booth, lay the ball down and step back; a walk alone takes half of it."""
+    _explained: bool = False
     _told_s: float = 0.0
     _open_line: bool = False
 
-    def step(self, title: str, instruction: str) -> None:
-        """Announce a step; wait until the operator is ready and in place."""
+    def step(self, title: str, instruction: str = "", *, lays: bool = False) -> None:
+        """Announce a step; wait until the operator is ready and in place.
+
+        ``lays``: the operator has something to lay down there, after the walk.
+        """
         self.title(title)
-        click.echo(f"  {instruction}")
+        if instruction:
+            click.echo(f"  {instruction}")
         if not self.attended:
             return
-        click.prompt(
-            f"  Enter starts a countdown of {self.countdown_s:g} s",
-            default="", show_default=False, prompt_suffix=" ",
-        )  # fmt: skip
-        for left in range(int(self.countdown_s), 0, -1):
-            bell = _BELL if left <= _LAST_SECONDS else ""
-            self.progress(f"{left} ...{bell}", now=True)
+        seconds = self._seconds(lays)
+        words = f"{seconds} s" if self._explained else f"starts a countdown of {seconds} s"
+        self._explained = True
+        click.prompt(f"  Enter {words}", default="", show_default=False, prompt_suffix=" ")
+        self.count_down(lays=lays)
+
+    def count_down(self, *, lays: bool = False) -> None:
+        """Count the seconds until the operator is in place; nothing when nobody is there."""
+        for left in range(self._seconds(lays) if self.attended else 0, 0, -1):
+            self._tick(left)
             time.sleep(1.0)
-        self.progress(f"now{_BELL}", now=True)
+        if self.attended:
+            self._tick(0)
+
+    def _seconds(self, lays: bool) -> int:
+        return int(self.countdown_s if lays else 0.5 * self.countdown_s)
+
+    def _tick(self, left: int) -> None:
+        words = f"{left} ..." if left else "now"
+        self.progress(f"{words}{_BELL if left <= _LAST_SECONDS else ''}", now=True)
 
     def title(self, text: str) -> None:
         """Print the title of what begins now."""
@@ -70,17 +87,12 @@ class Guide:
         self.end_line()
         return self.attended and click.confirm(f"  {question}", default=True)
 
-    def height_m(self) -> float | None:
+    def height_m(self, question: str) -> float | None:
         """The measured height of a stand, metres; None when there is none or nobody to ask."""
         self.end_line()
         if not self.attended:
             return None
-        answer = click.prompt(
-            "  A ball on a stand of measured height makes heights more accurate. Height of its "
-            "underside above the floor in metres (0: no stand)",
-            type=_HEIGHT,
-            default=0.0,
-        )
+        answer = click.prompt(f"  {question} Metres (0: no stand)", type=_HEIGHT, default=0.0)
         return float(answer) or None
 
     def end_line(self) -> None:

@@ -26,10 +26,18 @@ from station.core.errors import CalibrationError
 
 _SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
+_BOARDS = 3
+"""Places of the board that a calibration asks for; a fourth buys next to nothing."""
 _STAND_M = (0.3, 2.2)
 """Heights of a stand that cameras of a booth see."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
 """Places of the ball: three that are not on one line show the floor's slope both ways."""
+_STANDS = (
+    "Put the ball on a stand on the mark, best as high as a head, for more accurate heights. How "
+    "high is its underside above the floor?",
+    "Now about half as high: a wrong measurement shows. How high is its underside?",
+)
+"""A question for each height of the stand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +91,7 @@ class Procedure:
         if session is None or session.around_count < len(_AROUND):
             self.around(asked=True)
         self.stands()
-        if session is None or not session.done(WALL):
+        if session is None or session.wall_count < _BOARDS:
             self.walls(asked=True)
         self.solve()
 
@@ -114,7 +122,7 @@ class Procedure:
     def rest(self, step: str) -> None:
         """The ball on the mark, or in front of it."""
         where = "on the mark" if step == MARK else "on the floor in front of the mark, 0.5 m away"
-        self._lay(step, where)
+        self._lay(step, f"Ball {where}", "Lay it down and step back.")
 
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
@@ -130,50 +138,82 @@ class Procedure:
             ):
                 return
             where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
-            exactly = ", 0.6 m away, where a lower camera sees it"
-            self._lay(step, f"on the floor {where}", exactly)
+            instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
+            self._lay(step, f"Ball on the floor {where}", instruction)
 
     def stands(self) -> None:
-        """The ball on a stand at as many heights as the operator (or the recordings) likes."""
+        """The ball on a stand, at two heights that the operator gives; at all that are recorded."""
         if self.recordings is not None:
             for folder in sorted(self.recordings.glob(f"{STAND}-*")):
                 millimetres = folder.name.removeprefix(f"{STAND}-")
                 self.stand(1e-3 * int(millimetres) if millimetres.isdecimal() else float("nan"))
             return
-        while (height_m := self.guide.height_m()) is not None:
-            self.stand(height_m)
+        session = self.unfinished_session()
+        before = session.stand_count if session else 0
+        if self.guide.attended and before < len(_STANDS):
+            self.guide.title("Ball on a stand")
+        for question in _STANDS[before:]:
+            if (height_m := self.guide.height_m(question)) is None:
+                return
+            self.stand(height_m, ready=True)
 
-    def stand(self, height_m: float) -> None:
-        """The ball on a stand, its underside at a measured height above the floor."""
+    def stand(self, height_m: float, *, ready: bool = False) -> None:
+        """The ball on a stand, its underside at a measured height above the floor.
+
+        ``ready``: it stands there already.
+        """
         if not _STAND_M[0] <= height_m <= _STAND_M[1]:
             raise CalibrationError(
                 f"a stand of {height_m:g} m cannot be used: its height is in metres, 0.3 to 2.2"
             )
-        where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
-        self._lay(f"{STAND}-{round(1e3 * height_m)}", where)
+        step = f"{STAND}-{round(1e3 * height_m)}"
+        if ready:
+            self.guide.count_down()
+            self._see_at_rest(step)
+        else:
+            where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
+            self._lay(step, f"Ball {where}", "Put it up and step back.")
 
     def walls(self, asked: bool) -> None:
-        """The flat board at as many places as the operator (or the recordings) likes."""
+        """The flat board at some places: as many as are asked for, as the operator likes, or as are
+        recorded."""
         # Live, a further board is added to those that were seen; recordings have their own places.
         session = self.unfinished_session()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
-        before = session.wall_count if session and self.recordings is None else 0
-        for place in range(before, before + _MAX_BOARDS):
+        live = self.recordings is None
+        before = session.wall_count if live else 0
+        for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
             if self.recordings is not None:
                 if not (self.recordings / f"{WALL}-{place}").is_dir():
                     return
-            elif (asked or place > before) and not self.guide.answers_yes(
-                "A flat board at several distances improves the depth accuracy. Record it at one "
-                "more place?"
-            ):
+            elif not self._board_stands(place, first=place == before, asked=asked):
                 return
-            self.guide.step(
-                f"Flat board, place {place + 1}",
-                "Stand a flat board (1 m or wider) upright across the booth; then another place.",
-            )
             with self._feed(f"{WALL}-{place}") as (feed, session):
                 look_at_wall(feed, session, self.guide, place)
+
+    def _board_stands(self, place: int, *, first: bool, asked: bool) -> bool:
+        """Wait until the operator has put up the board; false if it is not wanted there."""
+        if first and not asked:
+            self.guide.step(
+                "Flat board", "Stand a flat board (1 m or wider) upright across the booth."
+            )
+            return True
+        if first and self.guide.attended:
+            self.guide.title("Flat board")
+        if first:
+            question = (
+                "Stand a flat board (1 m or wider) upright across the booth, for more accurate "
+                "depths. Is it there?"
+            )
+        elif place < _BOARDS:
+            question = f"Place {place + 1} of {_BOARDS}, nearer or farther. Is it there?"
+        else:
+            question = "Another place, nearer or farther. Is it there?"
+        if not self.guide.answers_yes(question):
+            return False
+        self.guide.count_down()
+        return True
 
     def solve(self) -> None:
         """The solution from what was seen, put into use."""
@@ -201,8 +241,11 @@ class Procedure:
         self.store.use(entry.name)
         self.guide.done(f"calibration {entry.name} is in use ({entry.folder})")
 
-    def _lay(self, step: str, where: str, exactly: str = "") -> None:
-        self.guide.step(f"Ball {where}", f"Lay the ball {where}{exactly}; then step back.")
+    def _lay(self, step: str, title: str, instruction: str) -> None:
+        self.guide.step(title, instruction, lays=True)
+        self._see_at_rest(step)
+
+    def _see_at_rest(self, step: str) -> None:
         with self._feed(step) as (feed, session):
             self._remark_on_ghosts(session)
             rest_ball(feed, session, self.guide, step)

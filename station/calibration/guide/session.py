@@ -151,9 +151,7 @@ class Session:
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
             f"{self.around_count} places around it": bool(self.around_count),
-            f"{len(self.around) - self.around_count} heights of the stand": (
-                len(self.around) > self.around_count
-            ),
+            f"{self.stand_count} heights of the stand": bool(self.stand_count),
             f"{self.wall_count} boards": self.done(WALL),
         }
         return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
@@ -175,6 +173,11 @@ class Session:
     def around_count(self) -> int:
         """Places on the floor around the mark at which the ball was seen."""
         return sum(place.startswith(AROUND) for place in self.around)
+
+    @property
+    def stand_count(self) -> int:
+        """Heights of the stand at which the ball was seen."""
+        return len(self.around) - self.around_count
 
     @property
     def wall_count(self) -> int:

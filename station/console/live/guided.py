@@ -36,15 +36,15 @@ class PageGuide(Guide):
             raise KeyboardInterrupt
         return line.strip()
 
-    def step(self, title: str, instruction: str) -> None:
+    def step(self, title: str, instruction: str = "", *, lays: bool = False) -> None:
         self._say("step", title=title, text=instruction, waits=self.attended)
         if not self.attended:
             return
         self._answer()
-        for left in range(int(self.countdown_s), 0, -1):
-            self._say("countdown", left_s=left)
-            time.sleep(1.0)
-        self._say("countdown", left_s=0)
+        self.count_down(lays=lays)
+
+    def _tick(self, left: int) -> None:
+        self._say("countdown", left_s=left)
 
     def title(self, text: str) -> None:
         self._say("step", title=text, text="", waits=False)
@@ -67,14 +67,10 @@ class PageGuide(Guide):
         self._say("question", text=question)
         return self._answer() == "yes"
 
-    def height_m(self) -> float | None:
+    def height_m(self, question: str) -> float | None:
         if not self.attended:
             return None
-        self._say(
-            "height",
-            text="A ball on a stand of measured height on the mark makes heights more accurate. "
-            "How high is its underside above the floor?",
-        )
+        self._say("height", text=question)
         answer = self._answer()
         return None if answer == "no" else float(answer)
 

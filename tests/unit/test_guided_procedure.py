@@ -1,0 +1,147 @@
+"""Questions and instructions of a guided calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+import click
+import pytest
+
+from station.calibration.detect.detections import EMPTY
+from station.calibration.guide import procedure
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.procedure import Procedure
+from station.calibration.guide.session import Session
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import BoothConfig
+from station.simulation.scene import default_rig
+
+COUNTDOWN_S = 8.0
+
+
+@pytest.fixture
+def seconds(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Slept seconds instead of sleep."""
+    slept: list[float] = []
+    monkeypatch.setattr("station.calibration.guide.operator.time.sleep", slept.append)
+    return slept
+
+
+@pytest.fixture
+def guided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Procedure, Session, list[str]]:
+    """A procedure with an empty booth seen, its session, and the steps at which cameras look."""
+    store = CalibrationStore(tmp_path / "calibrations", tmp_path / "calibration.json")
+    session = Session.begin(store.unfinished, "2026", 0.1, default_rig().cameras)
+    session.record_empty({}, [])
+    looked: list[str] = []
+
+    @contextmanager
+    def no_feed(_: Procedure, step: str) -> Iterator[tuple[None, Session]]:
+        looked.append(step)
+        yield None, session
+
+    monkeypatch.setattr(Procedure, "_feed", no_feed)
+    monkeypatch.setattr(
+        procedure, "look_at_wall", lambda _, own, __, place: own.record_wall(f"wall-{place}", [])
+    )
+    monkeypatch.setattr(
+        procedure, "rest_ball", lambda _, own, __, step: own.record_resting(step, [])
+    )
+    guide = Guide(attended=True, countdown_s=COUNTDOWN_S)
+    begun = Procedure(cast(BoothConfig, None), store, None, guide)
+    assert session.done(EMPTY)
+    return begun, session, looked
+
+
+def _answers(monkeypatch: pytest.MonkeyPatch, confirmed: list[bool]) -> None:
+    monkeypatch.setattr(click, "prompt", lambda *_, **__: "")
+    monkeypatch.setattr(click, "confirm", lambda *_, **__: confirmed.pop(0))
+
+
+def test_three_boards_are_asked_for_and_no_more(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A question, an instruction and another prompt stood before each of any number of places."""
+    begun, session, looked = guided
+    _answers(monkeypatch, [True] * 9)
+    begun.walls(asked=True)
+    assert looked == ["wall-0", "wall-1", "wall-2"]
+    assert sum(seconds) == 3 * COUNTDOWN_S / 2
+    begun.walls(asked=True)
+    assert session.wall_count == 3
+
+
+def test_a_board_that_is_not_there_ends_the_step(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun, _, looked = guided
+    _answers(monkeypatch, [True, False])
+    begun.walls(asked=True)
+    assert looked == ["wall-0"]
+    _answers(monkeypatch, [True, True, True, False])
+    begun.walls(asked=False)
+    assert looked == ["wall-0", "wall-1", "wall-2", "wall-3", "wall-4"]
+    assert sum(seconds) == 5 * COUNTDOWN_S / 2
+
+
+def test_two_heights_of_a_stand_are_asked_for(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It asked for one more height until somebody entered 0; the second one is not left out, for it
+    shows that the first was measured wrongly."""
+    begun, session, looked = guided
+    heights_m = [1.7, 0.9]
+    monkeypatch.setattr(click, "prompt", lambda *_, **__: heights_m.pop(0))
+    begun.stands()
+    begun.stands()
+    assert looked == ["stand-1700", "stand-900"]
+    assert session.stand_count == 2
+    assert sum(seconds) == COUNTDOWN_S
+
+
+def test_no_stand_is_asked_about_once(
+    guided: tuple[Procedure, Session, list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun, _, looked = guided
+    answers = [0.0, 1.7]
+    monkeypatch.setattr(click, "prompt", lambda *_, **__: answers.pop(0))
+    begun.stands()
+    assert answers == [1.7]
+    assert looked == []
+
+
+def test_instructions_are_given_once(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    begun, _, looked = guided
+    _answers(monkeypatch, [])
+    begun.around(asked=True)
+    said = capsys.readouterr().out
+    assert looked == ["around-0", "around-1", "around-2"]
+    assert sum(seconds) == 3 * COUNTDOWN_S
+    assert said.count("where a lower camera sees it") == 1
+    assert "Ball on the floor behind the mark" in said
+
+
+def test_all_recorded_places_of_the_board_are_used(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path
+) -> None:
+    begun, _, looked = guided
+    for place in range(5):
+        (tmp_path / f"wall-{place}").mkdir()
+    unattended = Guide(attended=False, countdown_s=COUNTDOWN_S)
+    Procedure(begun.config, begun.store, tmp_path, unattended).walls(asked=True)
+    assert looked == [f"wall-{place}" for place in range(5)]
