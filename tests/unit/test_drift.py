@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -148,6 +149,27 @@ def test_a_bare_wall_says_nothing_of_moves_along_it() -> None:
     nearer = _view(wall, (0.0, 0.0, 0.0, 0.0, 0.0, 0.005))
     assert not any("forward" in words for words in move.unseen_words())
     assert estimate_move(bare, _frames(nearer, 10, seed=8), DEPTH_SCALE_M).moved
+
+
+def test_an_edge_that_loses_pixels_is_no_moved_camera() -> None:
+    """A wall's upper edge alone showed the camera's height. Pixels that it lost were to have another
+    profile across the edge than a shift, and counted as 8 mm."""
+    wall = (box((-6.0, 1.6, -4.0), (6.0, 1.7, 1.3)),)
+    bare = DriftReference.prepare(
+        CAMERA, static_view(_frames(_view(wall), 45, seed=14), DEPTH_SCALE_M)
+    )
+    lost = [_without_edges(frame, 2) for frame in _frames(_view(wall), 10, seed=15)]
+    move = estimate_move(bare, lost, DEPTH_SCALE_M)
+    assert move.alarm() < 0.6
+    assert "shift up or down" in move.unseen_words()
+
+
+def _without_edges(frame: NDArray[np.uint16], pixels: int) -> NDArray[np.uint16]:
+    """A frame whose silhouettes against nothing lose pixels."""
+    square = np.ones((5, 5), np.uint8)
+    nothing = cv2.morphologyEx((frame == 0).astype(np.uint8), cv2.MORPH_OPEN, square)
+    reach = np.ones((2 * pixels + 1,) * 2, np.uint8)
+    return np.where(cv2.dilate(nothing, reach) > 0, 0, frame).astype(np.uint16)
 
 
 def test_a_move_within_the_tolerance_never_alarms_and_words_say_where() -> None:

@@ -103,7 +103,8 @@ class DriftReference:
         steepness = np.hypot(slope[..., 0], slope[..., 1])
         height, width = rows.shape
         block = np.arange(height)[:, None] // BLOCK * width + np.arange(width) // BLOCK
-        step = cv2.dilate(with_gaps, reach) - cv2.erode(with_gaps, reach)
+        across = np.ones((4 * _EDGE_REACH_PX + 1,) * 2, np.uint8)
+        step = cv2.dilate(with_gaps, across) - cv2.erode(with_gaps, across)
         gap = np.clip(nearest / np.maximum(step, 1e-3), 1.0, _DEEPEST)
         common, local = _disturbances(image[at], visible, outline[at], steep[at], gap[at])
         return cls(
