@@ -194,16 +194,17 @@ class ScanWriter:
         Raises:
             CalibrationError: naming the cameras that moved.
         """
-        moved = [
-            move.words()
-            for name in self._names
+        moved = []
+        for name in self._names:
             for move in self._drift.moves(
                 collection.rig.cameras[name],
                 [found.frames[name].depth for found in collection.sets],
                 collection.sets[0].frames[name].header.depth_scale_m,
-            )
-            if move.moved or move.lost
-        ]
+            ):
+                if self._drift.confirmed(move):
+                    moved.append(move.words())
+                elif move.moved:
+                    self._log.warning("the next scan decides: %s", move.words())
         if moved:
             raise CalibrationError(
                 f"{'; '.join(moved)}; put the camera back and run station check, or run station "

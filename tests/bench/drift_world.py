@@ -68,22 +68,30 @@ _CURTAIN_X_M = (-1.5, 1.5)
 """A curtain hangs somewhere along the wall behind the person, another along that in front."""
 _COAT_M = (0.2, 0.08, 0.45)
 """Half its width, depth and height."""
+_BODIES = 64
+"""People of all scans."""
 _SEES = 0.3
 """Share of readings in the image of a camera that somebody would mount so."""
 
 
 def random_body(rng: np.random.Generator) -> Mesh:
     """Somebody who stands about where one should."""
+    body = _body(int(rng.integers(_BODIES)))
+    x, y = rng.normal(0.0, 0.05, 2)
+    return placed(body, x, y, rng.normal(0.0, 0.15))
+
+
+@lru_cache(maxsize=_BODIES)
+def _body(number: int) -> Mesh:
+    rng = np.random.default_rng((number, 28))
     model = load_model()
     twists = rng.multivariate_normal(model.twist_mean, model.twist_covariance).reshape(-1, 3)
     first = np.zeros((1, 3))
     rotations = model.absolute_rotations(np.concatenate([first, 0.7 * twists]))
     beta = rng.standard_normal(model.beta_count)
     vertices = model.vertices(BodyState(rotations, beta, np.zeros(3)))
-    vertices = vertices @ so3_exp([0.0, 0.0, rng.normal(0.0, 0.15)]).T
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    x, y = rng.normal(0.0, 0.05, 2)
-    return placed(Mesh(vertices - (middle[0], middle[1], vertices[:, 2].min()), model.faces), x, y)
+    return Mesh(vertices - (middle[0], middle[1], vertices[:, 2].min()), model.faces)
 
 
 def placed(mesh: Mesh, x: float, y: float, turn_rad: float = 0.0) -> Mesh:
@@ -105,6 +113,8 @@ class Visit:
     kind: Scene
     moments: tuple[VirtualScene, ...]
     seed: int
+    day: int
+    """Scans of one day share the sensors' warmth and silhouettes."""
 
 
 class DriftBooth:
@@ -136,8 +146,8 @@ class DriftBooth:
             return SCENES
         return tuple(scene for scene in SCENES if scene not in _FURNISHED)
 
-    def visit(self, kind: Scene, seed: int) -> Visit:
-        """One scan's scene."""
+    def visit(self, kind: Scene, seed: int, day: int | None = None) -> Visit:
+        """One scan's scene, on a day of its own if none is given."""
         rng = np.random.default_rng((self.seed, seed, 22))
         things, people = list(self._fixed), []
         if "empty" not in kind:
@@ -156,7 +166,7 @@ class DriftBooth:
         moments = [
             VirtualScene([*things, *(leaning(person, lean) for person in people)]) for lean in leans
         ]
-        return Visit(kind, tuple(moments), seed)
+        return Visit(kind, tuple(moments), seed, seed if day is None else day)
 
     def _furniture(self, kind: Scene, rng: np.random.Generator) -> list[Mesh]:
         """Furniture after a change: from a nudge, which looks like a moved camera, to another
@@ -230,7 +240,7 @@ class DriftSensor:
         self._seed = booth.seed
         rng = np.random.default_rng((booth.seed, self._index, 23))
         self._eroded_px = int(rng.integers(0, _MOST_ERODED_PX + 1))
-        moments = Visit("empty", (empty,), -1)
+        moments = Visit("empty", (empty,), -1, -1)
         self.stored: StaticView = static_view(
             self._frames(moments, np.zeros(6), STORED_FRAMES, rng, (0.0, 0.0), self._eroded_px),
             DEPTH_SCALE_M,
@@ -238,10 +248,11 @@ class DriftSensor:
 
     def frames(self, visit: Visit, xi: Array, count: int) -> list[Depth]:
         """Depth frames of a scan by this sensor, moved by xi since it was calibrated."""
-        rng = np.random.default_rng((self._seed, self._index, visit.seed, 24))
-        warmth = (rng.normal(0.0, _WARMTH_PER_M), rng.normal(0.0, _WARMTH_GAIN))
-        other = rng.random() < _ANOTHER_DAY
-        eroded = int(rng.integers(0, _MOST_ERODED_PX + 1)) if other else self._eroded_px
+        day = np.random.default_rng((self._seed, self._index, visit.day, 24))
+        warmth = (day.normal(0.0, _WARMTH_PER_M), day.normal(0.0, _WARMTH_GAIN))
+        other = day.random() < _ANOTHER_DAY
+        eroded = int(day.integers(0, _MOST_ERODED_PX + 1)) if other else self._eroded_px
+        rng = np.random.default_rng((self._seed, self._index, visit.seed, 27))
         return self._frames(visit, xi, count, rng, warmth, eroded)
 
     def _frames(

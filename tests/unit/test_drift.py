@@ -152,8 +152,8 @@ def test_a_bare_wall_says_nothing_of_moves_along_it() -> None:
 
 
 def test_an_edge_that_loses_pixels_is_no_moved_camera() -> None:
-    """A wall's upper edge alone showed the camera's height. Pixels that it lost were to have another
-    profile across the edge than a shift, and counted as 8 mm."""
+    """A wall's upper edge alone showed the camera's height. Pixels that it lost were expected with
+    another profile across the edge than a shift has, and counted as 8 mm."""
     wall = (box((-6.0, 1.6, -4.0), (6.0, 1.7, 1.3)),)
     bare = DriftReference.prepare(
         CAMERA, static_view(_frames(_view(wall), 45, seed=14), DEPTH_SCALE_M)

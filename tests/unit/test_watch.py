@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.scene import static_view
-from station.calibration.drift.watch import DriftWatch
+from station.calibration.drift.motion import CameraMove
+from station.calibration.drift.watch import Doubts, DriftWatch
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import CalibrationError
@@ -108,3 +109,44 @@ def test_without_a_stored_scene_there_is_nothing_to_check(store: CalibrationStor
     store.use("20261101T100000Z")
     shutil.rmtree(store.folder)
     assert DriftWatch(store).moves(CAMERA, _frames(20000), 1e-4) == []
+
+
+def _estimate(size: float, camera: str = "a") -> CameraMove:
+    """Estimate of a camera's move forward that is ``size`` times what alarms."""
+    sigma_m = 1e-3
+    xi = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0 * sigma_m * size])
+    return CameraMove(camera, xi, sigma_m**2 * np.diag([1e-4] * 3 + [1.0] * 3), 1.0)
+
+
+def test_a_slight_alarm_waits_for_the_next_scan() -> None:
+    """Three of 102 scans by cameras that stood still were refused, each hardly above the limit."""
+    doubts = Doubts()
+    assert not doubts.confirmed(_estimate(1.2))
+    assert not doubts.confirmed(_estimate(0.5))
+    assert not doubts.confirmed(_estimate(1.2))
+    assert not doubts.confirmed(_estimate(1.2, "b"))
+    assert doubts.confirmed(_estimate(1.3))
+    assert doubts.confirmed(_estimate(1.1))
+
+
+def test_a_clear_alarm_does_not_wait() -> None:
+    doubts = Doubts()
+    assert doubts.confirmed(_estimate(1.6))
+    assert doubts.confirmed(CameraMove("b", np.zeros(6), np.eye(6), 0.01))
+    assert not doubts.confirmed(CameraMove("b", np.zeros(6), np.eye(6), 1.0))
+
+
+def test_two_alarms_that_contradict_each_other_are_no_move() -> None:
+    doubts = Doubts()
+    assert not doubts.confirmed(_estimate(1.2))
+    assert not doubts.confirmed(_estimate(-1.2))
+
+
+def test_doubts_end_with_their_calibration(store: CalibrationStore) -> None:
+    watch = DriftWatch(store)
+    store.use("20261101T100000Z")
+    watch.moves(CAMERA, _frames(20000), 1e-4)
+    assert not watch.confirmed(_estimate(1.2))
+    store.use("20261102T100000Z")
+    watch.moves(CAMERA, _frames(20000), 1e-4)
+    assert not watch.confirmed(_estimate(1.2))

@@ -30,6 +30,11 @@ _CERTAINTY = 2.0
 _NOT_STILL = 5.0
 """... if it is also so far from none at all: of a camera that stands still, in the three directions
 in which errors may exceed the tolerance, once in 60,000 views, if errors are as stated."""
+_AT_ONCE = 1.5
+"""An alarm so many times what alarms needs no second scan."""
+_AGREE = 16.8
+"""Squared distance of two estimates of one move, in units of their covariances, that one pair in
+100 exceeds."""
 _POWER = 2.0
 """A move is surely noticed so many standard deviations beyond what alarms."""
 _TOLD_SIGMA_M = 0.002
@@ -73,6 +78,16 @@ class CameraMove:
     def moved(self) -> bool:
         """It has to be calibrated again before the next scan."""
         return not self.lost and self.alarm() > 1.0
+
+    @property
+    def certain(self) -> bool:
+        """One scan is enough to say so."""
+        return self.lost or self.alarm() > _AT_ONCE
+
+    def agrees(self, other: CameraMove) -> bool:
+        """Whether both may be estimates of one move."""
+        off = self.xi - other.xi
+        return float(off @ np.linalg.solve(self.stated + other.stated, off)) < _AGREE
 
     @property
     def stated(self) -> Array:

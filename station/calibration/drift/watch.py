@@ -1,4 +1,8 @@
-"""Check of the cameras with every scan: its background against the calibration's empty booth."""
+"""Check of the cameras with every scan: its background against the calibration's empty booth.
+
+A camera that moved stays moved. What hardly alarms is therefore told only if the next scan says the
+same: alarms of cameras that stand still are hardly above the limit, and mostly single.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,26 @@ from station.core.errors import BoothError, CalibrationError
 from station.core.rig import CameraCalibration
 
 
+class Doubts:
+    """Alarms that wait for the next scan."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, CameraMove] = {}
+
+    def confirmed(self, move: CameraMove) -> bool:
+        """Whether this scan's estimate, with that of the scan before, says that a camera moved."""
+        before = self._last.pop(move.camera, None)
+        if not (move.moved or move.lost):
+            return False
+        if move.moved:
+            self._last[move.camera] = move
+        return move.certain or (before is not None and move.agrees(before))
+
+    def forget(self) -> None:
+        """Nothing was seen before: another calibration is in use."""
+        self._last.clear()
+
+
 class DriftWatch:
     """The check against the calibration in use; it reloads when another is put into use."""
 
@@ -24,6 +48,11 @@ class DriftWatch:
         self._content = b""
         self._views: Mapping[str, StaticView] = {}
         self._references: dict[str, DriftReference] = {}
+        self._doubts = Doubts()
+
+    def confirmed(self, move: CameraMove) -> bool:
+        """Whether a scan is to be refused for a move; each scan's is asked for once, in order."""
+        return self._doubts.confirmed(move)
 
     def moves(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
@@ -54,6 +83,7 @@ class DriftWatch:
             if content == self._content:
                 return
             self._references, self._views, self._content = {}, {}, b""
+            self._doubts.forget()
             self._views = self._store.scene()
             self._content = content
         except (BoothError, OSError) as error:
