@@ -91,7 +91,11 @@ def main() -> None:
     for number in numbers:
         booth = DriftBooth(number, ROOMS[number % len(ROOMS)])
         for (name, draw), count in zip(_MOVES.items(), wanted, strict=True):
-            groups[name] += trials(booth, -(-count // arguments.booths), draw)
+            own = list(trials(booth, -(-count // arguments.booths), draw))
+            alarms = sum(trial.move.moved for trial in own)
+            named = sum(trial.named for trial in own)
+            groups[name] += own
+            print(f"{number} {name}: {alarms} alarms, {named} named, {len(own)} views", flush=True)
     _false_alarms(groups["still"], groups["small"])
     _detection(groups["random"], groups["limit"])
     _sizes([trial for group in groups.values() for trial in group])
