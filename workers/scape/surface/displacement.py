@@ -44,15 +44,16 @@ class _Round:
     """Largest angle between their normals."""
     stiffness: float
     """Factor of the prior's precision."""
-    tolerance: float
-    """Relative residual at which the solver stops. What is left then slides along the skin: with
-    1e-5 instead, surfaces differ by 1 to 2 mm along themselves, and err as much."""
+    enough: float
+    """Energy that is still to be gained, at which the solver stops. What is left then slides along
+    the skin: with a hundredth of it, surfaces differ by 1 to 2 mm along themselves, and err as
+    much."""
 
 
 _ROUNDS = (
-    _Round(0.030, np.radians(50), 20.0, 1e-1),
-    _Round(0.020, np.radians(45), 4.0, 5e-2),
-    _Round(0.012, np.radians(40), 1.0, 1e-2),
+    _Round(0.030, np.radians(50), 20.0, 30.0),
+    _Round(0.020, np.radians(45), 4.0, 3.0),
+    _Round(0.012, np.radians(40), 1.0, 0.2),
 )
 _SIGMA_PER_MISMATCH = 4.0
 """Standard deviation of the offsets per mismatch of the points and the model's surface, without the
@@ -185,7 +186,7 @@ def fit_surface(
         rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
         rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
         of_round_m = sigma_m / np.sqrt(round_.stiffness)
-        offset = solved(model, prior, of_round_m, rows, offset, round_.tolerance)
+        offset = solved(model, prior, of_round_m, rows, offset, round_.enough)
     assert before is not None
     return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
 

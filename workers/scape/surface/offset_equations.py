@@ -76,7 +76,7 @@ def solved(
     sigma_m: float,
     rows: OffsetRows,
     start: Array,
-    tolerance: float,
+    enough: float,
 ) -> Array:
     """Offsets (P, 3) that minimise the rows' weighted squares plus the prior's.
 
@@ -86,7 +86,9 @@ def solved(
     Args:
         sigma_m: standard deviation of the offsets in the prior.
         start: (P, 3), offsets to start from.
-        tolerance: of the residual against the right-hand side, both in the preconditioner's norm.
+        enough: squared residual, in the preconditioner's norm, at which to stop: about the energy
+            that is still to be gained. An energy and no share of one, since the share would solve
+            people near the model to micrometres and others to millimetres.
     """
     pattern = _pattern(model)
     blocks, right = _assembled(
@@ -96,7 +98,7 @@ def solved(
     return np.asarray(
         _conjugate_gradients(
             pattern.first, pattern.columns, prior.operator.data,
-            prior.tau_square(sigma_m) / prior.area_m2, blocks, right, start, tolerance, _MAX_STEPS,
+            prior.tau_square(sigma_m) / prior.area_m2, blocks, right, start, enough, _MAX_STEPS,
         )
     )  # fmt: skip
 
@@ -147,7 +149,7 @@ def _assembled(  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @numba.njit(cache=True, nogil=True)
 def _conjugate_gradients(  # type: ignore[no-untyped-def]  # pragma: no cover
-    first, columns, operator, scale, blocks, right, start, tolerance, most
+    first, columns, operator, scale, blocks, right, start, enough, most
 ):
     count = len(right)
     inverse = _inverse_diagonal(first, columns, operator, scale, blocks)
@@ -155,7 +157,6 @@ def _conjugate_gradients(  # type: ignore[no-untyped-def]  # pragma: no cover
     product, residual = np.empty((count, 3)), np.empty((count, 3))
     conditioned = np.empty((count, 3))
     _multiply(first, columns, operator, scale, blocks, found, conditioned, product)
-    enough = tolerance**2 * _precondition(inverse, right, conditioned)
     for v in range(count):
         for i in range(3):
             residual[v, i] = right[v, i] - product[v, i]
