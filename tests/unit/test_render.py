@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from station.core.geometry import so3_exp
-from workers.export.preview import _spread, preview
+from workers.export.preview import _spread, preview, views_of
 from workers.measure.body import Measurement, measure_body
 from workers.pictures.render import BACKGROUND, Frame, Scene
 from workers.scape.fit.verdict import Verdict
@@ -88,21 +88,21 @@ def test_labels_keep_clear_of_the_body_and_of_each_other(
     model: BodyModel, rows: list[Measurement]
 ) -> None:
     """Values once stood on the arms, and on top of each other."""
-    bare = _decoded(preview(model.mean, model.faces, [], OK))
+    bare = _decoded(preview(views_of(model.mean, model.faces), [], OK))
     assert bare.min() < 200
     # Two dozen lines that all end at one height have labels of their own all the same.
     crowded = _spread(np.full(12, 300.0), 24.0, 24.0, 500.0)
     assert np.diff(crowded).min() >= 24.0
     assert crowded[0] >= 24.0
     assert crowded[-1] <= 500.0
-    picture = _decoded(preview(model.mean, model.faces, rows, OK))
+    picture = _decoded(preview(views_of(model.mean, model.faces), rows, OK))
     assert picture.shape[1] > bare.shape[1] + 400
 
 
 def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]) -> None:
-    good = _decoded(preview(model.mean, model.faces, rows, OK))
+    good = _decoded(preview(views_of(model.mean, model.faces), rows, OK))
     verdict = Verdict("rescan", ("the cameras saw only 12 % of the left forearm", "x" * 1000))
-    again = _decoded(preview(model.mean, model.faces, rows, verdict))
+    again = _decoded(preview(views_of(model.mean, model.faces), rows, verdict))
     assert (good[-30:] == BACKGROUND).all()
     assert (again[-30:] != BACKGROUND).any()
     assert np.array_equal(again[:-34], good[:-34])
@@ -111,8 +111,10 @@ def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]
 
 def test_a_picture_carries_its_order(model: BodyModel) -> None:
     about = {"label": "Größe 7 \u7c97", "booth": "", "verdict": "ok"}
-    content = preview(model.mean, model.faces, [], OK, about=about)
-    assert np.array_equal(_decoded(content), _decoded(preview(model.mean, model.faces, [], OK)))
+    content = preview(views_of(model.mean, model.faces), [], OK, about=about)
+    assert np.array_equal(
+        _decoded(content), _decoded(preview(views_of(model.mean, model.faces), [], OK))
+    )
     with Image.open(io.BytesIO(content)) as picture:
         picture.verify()
         assert picture.info == {"label": "Größe 7 \u7c97", "verdict": "ok"}
@@ -120,13 +122,13 @@ def test_a_picture_carries_its_order(model: BodyModel) -> None:
 
 def test_a_row_that_is_not_measured_is_left_out(model: BodyModel, rows: list[Measurement]) -> None:
     some = [row for row in rows if row.name != "waist_girth"]
-    assert len(preview(model.mean, model.faces, some, OK)) > 1000
+    assert len(preview(views_of(model.mean, model.faces), some, OK)) > 1000
 
 
 def test_the_front_is_the_persons(model: BodyModel, rows: list[Measurement]) -> None:
     """Whichever way they stood."""
     turn = so3_exp(np.array([0.0, 0.0, 2.0]))
     turned = [replace(row, path=row.path @ turn.T) for row in rows]
-    ahead = _decoded(preview(model.mean, model.faces, rows, OK))
-    away = _decoded(preview(model.mean @ turn.T, model.faces, turned, OK, 2.0))
+    ahead = _decoded(preview(views_of(model.mean, model.faces), rows, OK))
+    away = _decoded(preview(views_of(model.mean @ turn.T, model.faces, 2.0), turned, OK))
     assert np.mean(np.abs(ahead.astype(float) - away) > 8.0) < 0.01

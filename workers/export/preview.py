@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -62,29 +62,46 @@ _BENEATH_M = 0.06
 _STATURE_GAP = 16
 
 
-def preview(
-    vertices: Array,
-    faces: NDArray[np.int32],
-    measurements: Sequence[Measurement],
-    verdict: Verdict,
-    heading_rad: float = 0.0,
-    about: Mapping[str, str] | None = None,
-) -> bytes:
-    """Picture of a body as PNG.
+@dataclass(frozen=True, slots=True)
+class Views:
+    """A body drawn from the sides that the preview shows."""
+
+    turn: Array
+    """(3, 3): from the world to a body that faces -y; applied from the right."""
+    frames: list[Frame]
+    renderings: list[Rendering]
+
+
+def views_of(vertices: Array, faces: NDArray[np.int32], heading_rad: float = 0.0) -> Views:
+    """Draw a body (P, 3), without measurements.
 
     Args:
         heading_rad: rotation of the body about z from -y.
-        about: texts that the PNG carries as iTXt chunks.
     """
     turn = so3_exp(np.array([0.0, 0.0, heading_rad]))
     vertices = vertices @ turn
-    by_name = {row.name: replace(row, path=row.path @ turn) for row in measurements}
     frames = [_frame(vertices, view) for view in _SHOWN]
     with ThreadPoolExecutor(2) as pool:
-        renderings = list(pool.map(Scene(vertices, faces).render, frames))
+        return Views(turn, frames, list(pool.map(Scene(vertices, faces).render, frames)))
+
+
+def preview(
+    views: Views,
+    measurements: Sequence[Measurement],
+    verdict: Verdict,
+    about: Mapping[str, str] | None = None,
+) -> bytes:
+    """Picture of a body and its measurements as PNG.
+
+    Args:
+        about: texts that the PNG carries as iTXt chunks.
+    """
+    by_name = {row.name: replace(row, path=row.path @ views.turn) for row in measurements}
     panels = [
         _panel(frame, rendering, _rows(by_name, left), _rows(by_name, right))
-        for frame, rendering, (left, right) in zip(frames, renderings, _SHOWN.values(), strict=True)
+        for frame, rendering, (left, right) in zip(
+            views.frames, views.renderings, _SHOWN.values(), strict=True
+        )
     ]
     picture = np.concatenate(panels, axis=1)
     strip = np.full((_STRIP, picture.shape[1], 3), BACKGROUND, np.uint8)

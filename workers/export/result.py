@@ -7,6 +7,7 @@ import json
 import math
 import platform
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -15,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from station import __version__
-from workers.cloud.observed import PointCloud
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.origin import Origin
-from workers.export.preview import preview
+from workers.export.preview import Views, preview, views_of
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import Content, MeasuredBody, Measurement
 from workers.measure.differences import side_differences
@@ -31,11 +31,38 @@ STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 
 
+@dataclass(frozen=True, slots=True)
+class SurfaceFiles:
+    """Files of a result that need no measurements, made while the body is measured."""
+
+    contents: dict[str, bytes]
+    """By file name."""
+    views: Views
+
+
+def surface_files(
+    model: BodyModel, fit: FitResult, origin: Origin, watch: Stopwatch
+) -> SurfaceFiles:
+    """Files that need no measurements, and the preview's pictures of the body."""
+    with watch.step("export"):
+        about, comments = _about(fit, origin), _comments(fit, origin)
+        cloud = fit.cloud
+        contents = {
+            "mesh.ply": ply_mesh(fit.vertices, model.faces, comments),
+            "mesh.obj": obj_mesh(fit.vertices, model, comments),
+            "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
+            "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
+        }
+        forward = -fit.state.rotations[0][:, 1]
+        heading_rad = float(np.arctan2(forward[0], -forward[1]))
+        return SurfaceFiles(contents, views_of(fit.vertices, model.faces, heading_rad))
+
+
 def write_result(
     folder: Path,
     model: BodyModel,
     fit: FitResult,
-    cloud: PointCloud,
+    surface: SurfaceFiles,
     measured: MeasuredBody,
     standing: MeasuredBody,
     origin: Origin,
@@ -49,25 +76,15 @@ def write_result(
         standing: the same body in the standard pose.
     """
     with watch.step("export"):
-        faces = model.faces
-        about = {**origin.to_json(), "verdict": verdict_document(fit.verdict)}
-        comments = [*origin.comments(), f"verdict {fit.verdict.status}"]
+        missing = fit.verdict.missing_parts
+        rows = [row for row in measured.rows if not _is_blank(row, missing)]
+        texts = {**origin.to_json(), "verdict": fit.verdict.status}
         # Drawing releases the interpreter's lock, so it runs beside the other files.
         with ThreadPoolExecutor(1) as beside:
-            missing = fit.verdict.missing_parts
-            rows = [row for row in measured.rows if not _is_blank(row, missing)]
-            forward = -fit.state.rotations[0][:, 1]
-            heading_rad = float(np.arctan2(forward[0], -forward[1]))
-            texts = {**origin.to_json(), "verdict": fit.verdict.status}
-            picture = beside.submit(
-                preview, fit.vertices, faces, rows, fit.verdict, heading_rad, texts
-            )
+            picture = beside.submit(preview, surface.views, rows, fit.verdict, texts)
             files = {
-                "mesh.ply": ply_mesh(fit.vertices, faces, comments),
-                "mesh.obj": obj_mesh(fit.vertices, model, comments),
-                "mesh.glb": mesh_glb(fit.vertices, faces, rows, about),
-                "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
-                "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
+                **surface.contents,
+                "mesh.glb": mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin)),
                 "measurements.json": _json(measurements_document(origin, measured, fit.verdict)),
                 STANDARD_POSE_FILE: _json(measurements_document(origin, standing, fit.verdict)),
                 "preview.png": picture.result(),
@@ -76,8 +93,18 @@ def write_result(
             (folder / name).write_bytes(content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     seconds = {**watch.seconds, "total": watch.total_s()}
-    document = result_document(model, fit, cloud.origin_m, origin, method, seconds, hashes)
+    document = result_document(model, fit, origin, method, seconds, hashes)
     (folder / "result.json").write_bytes(_json(document))
+
+
+def _about(fit: FitResult, origin: Origin) -> dict[str, Any]:
+    """Extras of the glTF files."""
+    return {**origin.to_json(), "verdict": verdict_document(fit.verdict)}
+
+
+def _comments(fit: FitResult, origin: Origin) -> list[str]:
+    """Comments of the PLY and OBJ files."""
+    return [*origin.comments(), f"verdict {fit.verdict.status}"]
 
 
 def verdict_document(verdict: Verdict) -> dict[str, Any]:
@@ -141,7 +168,6 @@ def measurements_document(
 def result_document(
     model: BodyModel,
     fit: FitResult,
-    origin_m: tuple[float, float, float],
     origin: Origin,
     method: str,
     seconds: dict[str, float],
@@ -161,7 +187,7 @@ def result_document(
         "shape": fit.state.beta.tolist(),
         "pose": dict(zip(model.part_names, twists.tolist(), strict=True)),
         "translation": fit.state.translation.tolist(),
-        "origin_m": list(origin_m),
+        "origin_m": list(fit.cloud.origin_m),
         "quality": {
             "point_to_surface_rms_m": fit.point_to_surface_rms_m,
             "coverage": fit.coverage,

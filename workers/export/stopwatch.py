@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Measures named steps, and the whole from its creation on."""
+    """Measures named steps, which may have several parts, and the whole from its creation on."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     _start_s: float = field(default_factory=time.monotonic)
@@ -21,7 +21,7 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[name] = time.monotonic() - start_s
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start_s
 
     def total_s(self) -> float:
         return time.monotonic() - self._start_s
