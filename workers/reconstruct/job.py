@@ -6,6 +6,7 @@ filter the depth images, fit the SCAPE model to them, measure the body.
 
 from __future__ import annotations
 
+import atexit
 import gc
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -76,6 +77,8 @@ def warm_up() -> BodyModel:
     preview(views_of(model.mean, model.faces), measured.rows, fit.verdict)
     gc.collect()
     gc.freeze()
+    # At its end the interpreter frees everything, so that no library reports leaks.
+    atexit.register(gc.unfreeze)
     return model
 
 
