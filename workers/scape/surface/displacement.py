@@ -39,7 +39,8 @@ Index = NDArray[np.intp]
 @dataclass(frozen=True, slots=True)
 class _Round:
     gate_m: float
-    """Largest distance between a point and the vertex next to it."""
+    """Largest distance between a point and the vertex next to it. Edges of trunk and limbs are up
+    to 28 mm long, so that the middle of a triangle is 16 mm away from its corners."""
     angle_rad: float
     """Largest angle between their normals."""
     stiffness: float
@@ -53,9 +54,9 @@ class _Round:
 _ROUNDS = (
     _Round(0.030, np.radians(50), 20.0, 30.0),
     _Round(0.020, np.radians(45), 4.0, 3.0),
-    _Round(0.012, np.radians(40), 1.0, 0.2),
+    _Round(0.020, np.radians(40), 1.0, 0.2),
 )
-_SIGMA_PER_MISMATCH = 4.0
+_SIGMA_PER_MISMATCH = 3.5
 """Standard deviation of the offsets per mismatch of the points and the model's surface, without the
 points' noise. More than 1, since folds and edges are steeper than a field of one range."""
 _NOISE_LEFT = 0.8
