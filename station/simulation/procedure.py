@@ -255,7 +255,7 @@ class _Waving:
             Capsule(hand + 0.03 * grip, elbow, 0.038),
             Capsule(elbow, shoulder, 0.05),
         ]
-        for spread in (-0.6, 0.0, 0.6):
+        for spread in (-0.6, -0.2, 0.2, 0.6):
             side = across * np.cos(spread) + np.cross(grip, across) * np.sin(spread)
             tip = 0.75 * grip + 0.66 * side
             parts.append(Capsule(hand, center_m + (radius_m + 0.006) * tip, 0.009))
