@@ -38,7 +38,7 @@ class Guide:
         if not self.attended:
             return
         seconds = self._seconds(lays)
-        words = f"{seconds} s" if self._explained else f"starts a countdown of {seconds} s"
+        words = f"({seconds} s)" if self._explained else f"starts a countdown of {seconds} s"
         self._explained = True
         click.prompt(f"  Enter {words}", default="", show_default=False, prompt_suffix=" ")
         self.count_down(lays=lays)
