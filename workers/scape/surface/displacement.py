@@ -66,6 +66,8 @@ _MIN_SIGMA_M = 0.0008
 bodies."""
 _INDEPENDENT = 0.2
 """Share of the points used that count as independent: the sensor's matching windows overlap."""
+_SEEN_M = 0.012
+"""Largest distance of a vertex that was seen from a point: at 20 mm a fog of points shows all."""
 _ON_SURFACE_M = 0.006
 """Largest distance of a point that lies on its triangle."""
 _MIN_NOISE_M = 3e-4
@@ -116,13 +118,15 @@ class _Readings:
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
 
-    def pairs(self, model: BodyModel, vertices: Array, round_: _Round) -> tuple[Index, Index]:
+    def pairs(
+        self, model: BodyModel, vertices: Array, gate_m: float, angle_rad: float
+    ) -> tuple[Index, Index]:
         """Readings (n,) near a surface (P, 3), and the vertex next to each."""
         return self.tracked.pairs(
             vertices,
             vertex_normals(vertices, model.faces),
-            max_distance_m=round_.gate_m,
-            max_angle_rad=round_.angle_rad,
+            max_distance_m=gate_m,
+            max_angle_rad=angle_rad,
         )
 
     def away_m(self, used: Index, places: Array) -> Array:
@@ -177,7 +181,7 @@ def fit_surface(
     before: _AtVertices | None = None
     for round_ in _ROUNDS:
         current = vertices + offset
-        used, vertex = readings.pairs(model, current, round_)
+        used, vertex = readings.pairs(model, current, round_.gate_m, round_.angle_rad)
         places = attached(model, current, readings.points[used], vertex)
         away = readings.away_m(used, places.of(vertices, model.faces))
         if before is None:
@@ -200,7 +204,7 @@ def _examined(
     Args:
         before: what the cloud said at the vertices before the surface was displaced.
     """
-    used, vertex = readings.pairs(model, vertices, _ROUNDS[-1])
+    used, vertex = readings.pairs(model, vertices, _SEEN_M, _ROUNDS[-1].angle_rad)
     places = attached(model, vertices, readings.points[used], vertex)
     away = readings.away_m(used, places.of(vertices, model.faces))
     after = readings.at_vertices(used, vertex, away, len(vertices))
