@@ -256,7 +256,8 @@ def _follow(
             return session
         if time.monotonic() > deadline_s:
             raise BoothError(
-                f"scan {scan_id} was not done in time (its state is {state}); see station status"
+                f"scan {scan_id} is not done yet (its state is {state}) and goes on; do not scan "
+                f"again: station find {scan_id} shows its outcome"
             )
         time.sleep(_POLL_S)
         # The order itself may not have been recorded; repeated, it is the same scan.

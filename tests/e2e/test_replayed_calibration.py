@@ -81,6 +81,7 @@ def test_a_booth_is_calibrated_from_replayed_recordings(recorded: Path) -> None:
     assert checked.returncode == 0, checked.stdout + checked.stderr
     assert checked.stdout.count("stands where it was calibrated") == 4
     assert "does not look as it did" not in checked.stdout
+    assert "the booth is in order" in checked.stdout
 
 
 def test_live_cameras_are_looked_at_like_recordings(make_station: Callable[..., Station]) -> None:

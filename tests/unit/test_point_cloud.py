@@ -66,21 +66,29 @@ def _person(rng: np.random.Generator, count: int = 8000) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("scale", "turn", "words"),
+    ("scale", "words"),
     [
-        (1000.0, False, "looks like millimetres; use --unit mm"),
-        (100.0, False, "looks like centimetres; use --unit cm"),
-        (1 / 0.0254, False, "looks like inches; use --unit in"),
-        (1.0, True, r"lying down\? say which axis points up: --up y"),
+        (1000.0, "looks like millimetres; use --unit mm"),
+        (100.0, "looks like centimetres; use --unit cm"),
+        (1 / 0.0254, "looks like inches; use --unit in"),
     ],
 )
-def test_other_units_and_axes_are_named(
-    tmp_path: Path, scale: float, turn: bool, words: str
-) -> None:
-    points = scale * _person(np.random.default_rng(2))
-    path = _written(tmp_path / "a.ply", points[:, [0, 2, 1]] if turn else points)
+def test_other_units_are_named(tmp_path: Path, scale: float, words: str) -> None:
+    path = _written(tmp_path / "a.ply", scale * _person(np.random.default_rng(2)))
     with pytest.raises(InputError, match=words):
         read_cloud(path, "z")
+
+
+@pytest.mark.parametrize("stated", ["x", "y", "z"])
+@pytest.mark.parametrize(("up", "columns"), [("x", [2, 0, 1]), ("y", [0, 2, 1]), ("z", [0, 1, 2])])
+def test_the_axis_that_points_up_is_named(
+    tmp_path: Path, stated: str, up: str, columns: list[int]
+) -> None:
+    path = _written(tmp_path / "a.ply", _person(np.random.default_rng(2))[:, columns])
+    if stated != up:
+        with pytest.raises(InputError, match=rf"lying down\? .* points up: --up {up}"):
+            read_cloud(path, stated)
+    assert np.ptp(read_cloud(path, up).points[:, 2]) == pytest.approx(1.75, abs=0.01)
 
 
 def test_a_cloud_in_millimetres_is_read_as_such(tmp_path: Path) -> None:

@@ -19,7 +19,12 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 _MAX_POINTS = 250_000
-_Z_FROM_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+Z_UP = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""Axis of a file that points up -> rotation to z up."""
 """Rotation of a cloud whose y points up."""
 _NORMAL_NEIGHBOURS = 24
 """Neighbours that a normal is estimated from."""
@@ -59,7 +64,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     file gives the same points.
 
     Args:
-        up: "z" or "y", the axis that points up.
+        up: the axis that points up, a key of `Z_UP`.
         unit: of the file, a key of `UNITS_M`.
 
     Raises:
@@ -68,8 +73,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     """
     cloud = _points_of(path)
     cloud.scale(UNITS_M[unit], np.zeros(3))
-    if up == "y":
-        cloud.rotate(_Z_FROM_Y, np.zeros(3))
+    cloud.rotate(Z_UP[up], np.zeros(3))
     check_units(np.asarray(cloud.points), unit, up)
     extent_m = float(np.ptp(np.asarray(cloud.points), axis=0).max())
     if not extent_m < _MAX_EXTENT_M:
@@ -218,7 +222,7 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
     """Vertices (P, 3), z up, of a mesh file with the template's triangles (K, 3).
 
     Args:
-        up: "z" or "y", the axis that points up in the file.
+        up: the axis that points up in the file, a key of `Z_UP`.
 
     Raises:
         InputError: the file is missing, is not a mesh, has values that are not finite or other
@@ -235,8 +239,7 @@ def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
             f"template's {faces.max() + 1} and {len(faces)}; fit it first: "
             f"reconstruct fit --cloud {path} --up {up} --out result"
         )
-    if up == "y":
-        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    vertices = vertices @ Z_UP[up].T
     low_m, high_m = float(vertices[:, 2].min()), float(vertices[:, 2].max())
     if not POSSIBLE_HEIGHTS_M[0] < high_m - low_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(

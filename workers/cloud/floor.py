@@ -29,6 +29,8 @@ _LOWEST_SHARE = 0.3
 """Share of the cloud's height in which a floor is searched for."""
 _CLEARANCE_M = 0.015
 """Points so near to the floor are taken away with it: noise of the floor, and soles."""
+_LEVEL_AXES = {"z": "xy", "y": "xz", "x": "yz"}
+"""Axis of a file that points up -> those that lie level once it is z."""
 _VOXEL_M = 0.04
 _PLANE_ROUNDS = 4
 
@@ -60,7 +62,7 @@ def check_units(points: Array, unit: str, up: str) -> None:
     if height_m < least and least < length_m < most:
         raise InputError(
             f"the cloud is {length_m:.2f} m long and {height_m:.2f} m high: is it lying down? "
-            f"say which axis points up: --up {'y' if up == 'z' else 'z'}"
+            f"say which axis points up: --up {_LEVEL_AXES[up][int(np.argmax(across_m))]}"
         )
 
 

@@ -17,7 +17,9 @@ from workers.scape.fit.fit import Method
 @click.command()
 @click.argument("bundle", type=click.Path(path_type=Path), required=False)
 @click.option("--cloud", type=click.Path(path_type=Path), help="a point cloud, .ply or .pcd")
-@click.option("--up", type=click.Choice(["z", "y"]), default="z", show_default=True, help="of it")
+@click.option(
+    "--up", type=click.Choice(["z", "y", "x"]), default="z", show_default=True, help="of it"
+)
 @click.option(
     "--unit",
     type=click.Choice(["m", "cm", "mm", "in"]),

@@ -28,7 +28,7 @@ _BLANK = "not measured"
     show_default=True,
     help="as the person stood, or in the standard standing pose",
 )
-@click.option("--up", type=click.Choice(["z", "y"]), default="z", help="a mesh's upward axis")
+@click.option("--up", type=click.Choice(["z", "y", "x"]), default="z", help="a mesh's upward axis")
 def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> None:
     """Print the measurements of a result folder, or measure a mesh in the template's topology.
 
@@ -136,6 +136,7 @@ def _print_table(document: dict[str, Any]) -> None:
     for name, text in _heading(document):
         click.echo(f"{name.replace('_', ' ')}: {_plain(text)}")
     click.echo("Values with 95 % intervals:")
+    unseen = False
     for row in document["measurements"]:
         tail = f"{words.get(row['name'], '')}{_in_brackets(row['standard'])}"
         if row["value_m"] is None:
@@ -145,7 +146,10 @@ def _print_table(document: dict[str, Any]) -> None:
         span = f"{100 * low:6.1f} to {100 * high:5.1f}" if high > low else ""
         basis = row.get("basis", "")
         basis = "" if basis == "seen" else basis
+        unseen = unseen or bool(basis)
         click.echo(f"{row['name']:<31}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}")
+    if unseen:
+        click.echo("partly, inferred: the cameras saw a part of this line, or hardly any of it")
     _print_differences(document)
     for name, unit, content in _contents(document):
         low, high = content["interval95"]
@@ -155,15 +159,20 @@ def _print_table(document: dict[str, Any]) -> None:
 
 def _print_differences(document: dict[str, Any]) -> None:
     """Differences between the sides whose interval does not contain 0."""
-    for row in document.get("differences", ()):
-        low, high = row["interval95_m"]
-        if low < high and (low > 0.0 or high < 0.0):
-            side = "left" if row["value_m"] > 0.0 else "right"
-            size, ends = abs(row["value_m"]), sorted((abs(low), abs(high)))
-            click.echo(
-                f"{row['name']:<31}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
-                f"{100 * ends[1]:5.1f}    larger on the {side}"
-            )
+    certain = [
+        row
+        for row in document.get("differences", ())
+        if (ends := row["interval95_m"])[0] < ends[1] and (ends[0] > 0.0 or ends[1] < 0.0)
+    ]
+    if certain:
+        click.echo("Differences between left and right:")
+    for row in certain:
+        side = "left" if row["value_m"] > 0.0 else "right"
+        size, ends = abs(row["value_m"]), sorted(map(abs, row["interval95_m"]))
+        click.echo(
+            f"{row['name']:<31}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
+            f"{100 * ends[1]:5.1f}    larger on the {side}"
+        )
 
 
 def _in_brackets(standard: str) -> str:

@@ -25,6 +25,7 @@ from station.core.rig import Rig
 _FRAMES = 30
 _SENSORS_S = 20.0
 _EXIT_MOVED = 3
+_EXIT_CHANGED = 4
 _SAME_SHARE = 0.97
 """An unchanged booth shows all of the stored background, a person hides a third of it."""
 
@@ -43,7 +44,8 @@ _SAME_SHARE = 0.97
 def check(config_path: Path | None, recordings: Path | None, as_json: bool, correct: bool) -> None:
     """Compare the empty booth with what was stored when it was calibrated.
 
-    Exit code 0: every camera stands where it did; 3: one has moved, calibrate again.
+    Exit code 0: every camera stands where it did; 3: one has moved, calibrate again; 4: the booth
+    looks too different to tell, put it in order and check again.
 
     With --correct: where the scans of the last people say that a camera has drifted, store and use
     a corrected calibration, provided that it also fits people whom it was not computed from.
@@ -107,6 +109,10 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
         )
     if any(move.moved or move.lost for move in moves):
         sys.exit(_EXIT_MOVED)
+    if changed:
+        sys.exit(_EXIT_CHANGED)
+    if not as_json:
+        click.echo("the booth is in order: no camera has moved, as far as their views can show")
 
 
 def _look(feed: Feed, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:
