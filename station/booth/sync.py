@@ -217,7 +217,8 @@ class SyncProcess:
         if silent := self._silent():
             return "; ".join(
                 f"camera {name} sends no frames{self._intake.why(name)}; "
-                "check its cable, see station status"
+                "scan again in a few seconds; if it stays silent, check its cable, see station "
+                "status"
                 for name in silent
             )
         return "; ".join(self._troubles())

@@ -116,7 +116,9 @@ def _rows(by_name: dict[str, Measurement], names: tuple[str, ...]) -> list[Measu
 
 
 def _label(row: Measurement) -> str:
-    words = [word for word in row.name.split("_") if word not in ("left", "right", "girth")]
+    words = [word for word in row.name.split("_") if word != "girth"]
+    if words[-1] in ("left", "right"):
+        words.insert(0, words.pop())
     return f"{' '.join(words)}  {100 * row.value_m:.1f} cm"
 
 
