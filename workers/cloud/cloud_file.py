@@ -115,8 +115,11 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
     if len(points) < MIN_POINTS:
         raise InputError(f"{path} has {len(points)} points; a body needs {MIN_POINTS}")
-    if not np.isfinite(points).all():
-        raise InputError(f"{path} holds points that are not numbers; repair it")
+    if broken := int((~np.isfinite(points)).any(axis=1).sum()):
+        raise InputError(
+            f"{broken} of the {len(points)} points of {path} are not numbers (NaN or infinite); "
+            "remove these and try again"
+        )
     if len(points) > _MAX_POINTS:
         kept = np.random.default_rng(len(points)).permutation(len(points))[:_MAX_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
