@@ -153,7 +153,8 @@ def test_floor_and_board_are_seen_without_bias(procedure: VirtualProcedure) -> N
     background = average(empty, DEPTH_SCALE_M).depth_m
     floor = observe_floor(empty, DEPTH_SCALE_M, camera)
     wall = observe_wall(board, DEPTH_SCALE_M, camera, "wall-1", background)
-    for seen, normal, distance in ((floor, (0, 0, 1), 0.0), (wall, (0, 1, 0), -0.19)):
+    back_m = procedure.board_at_m[1] + 0.01
+    for seen, normal, distance in ((floor, (0, 0, 1), 0.0), (wall, (0, 1, 0), back_m)):
         assert seen is not None
         u, v, w, _ = seen.patches.T
         K = camera.K
