@@ -18,7 +18,7 @@ from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
 from station.core.commands import config_option
-from station.core.config import find_config, load_config
+from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
 
@@ -58,17 +58,37 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     """
     config = load_config(find_config(config_path))
     if correct:
-        created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        drift, entry = use_correction(config, created)
-        click.echo(
-            f"camera {drift.camera} is now taken to stand where the scans of the last people saw "
-            f"it: {move_words(drift.xi)} from where it was calibrated"
-        )
-        click.echo(
-            f"calibration {entry.name} is in use; station calibrate --list shows the others, and "
-            "station calibrate --use DATE returns to one of them"
-        )
+        _correct(config)
         return
+    moves = _moves(config, recordings, quiet=as_json)
+    changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
+    moved = any(move.moved or move.lost for move in moves)
+    if as_json:
+        click.echo(json.dumps([_document(move) for move in moves]))
+    else:
+        _tell(moves, changed, moved=moved)
+    if moved:
+        sys.exit(_EXIT_MOVED)
+    if changed:
+        sys.exit(_EXIT_CHANGED)
+
+
+def _correct(config: BoothConfig) -> None:
+    """Put a calibration into use that the scans of the last people have corrected."""
+    created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    drift, entry = use_correction(config, created)
+    click.echo(
+        f"camera {drift.camera} is now taken to stand where the scans of the last people saw "
+        f"it: {move_words(drift.xi)} from where it was calibrated"
+    )
+    click.echo(
+        f"calibration {entry.name} is in use; station calibrate --list shows the others, and "
+        "station calibrate --use DATE returns to one of them"
+    )
+
+
+def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[CameraMove]:
+    """Estimates of how far each camera stands from where it was calibrated."""
     rig = Rig.load(config.calibration)
     scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
     missing = [camera.name for camera in config.cameras if camera.name not in scene]
@@ -79,8 +99,8 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
         )
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
-        taken = _look(feed, list(scene), quiet=as_json)
-    moves = [
+        taken = _look(feed, list(scene), quiet)
+    return [
         estimate_move(
             DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),
             [frame.depth for frame in frames],
@@ -88,18 +108,17 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
         )
         for name, frames in taken.items()
     ]
-    if as_json:
-        click.echo(json.dumps([_document(move) for move in moves]))
-    else:
-        for move in moves:
-            click.echo(move.words())
-            if not move.lost and move.unseen():
-                click.echo(
-                    f"  this view cannot detect a small {', '.join(move.unseen_words())}; "
-                    "a fixed post or corner in its view would make it possible"
-                )
-    changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
-    if changed and not as_json:
+
+
+def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) -> None:
+    for move in moves:
+        click.echo(move.words())
+        if not move.lost and move.unseen():
+            click.echo(
+                f"  this view cannot detect a small {', '.join(move.unseen_words())}; "
+                "a fixed post or corner in its view would make it possible"
+            )
+    if changed:
         most = min(changed, key=lambda move: move.share)
         percent = 100.0 * (1.0 - most.share)
         click.echo(
@@ -107,11 +126,7 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
             f"camera {most.camera} sees differs): remove people and objects that were "
             "not there and put back what is missing, so that small moves can be detected"
         )
-    if any(move.moved or move.lost for move in moves):
-        sys.exit(_EXIT_MOVED)
-    if changed:
-        sys.exit(_EXIT_CHANGED)
-    if not as_json:
+    elif not moved:
         click.echo("the booth is in order: no camera has moved, as far as their views can show")
 
 
