@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
-from workers.cloud.floor import UNITS_M, check_units, standing_on
+from workers.cloud.floor import UNITS_M, Z_UP, check_units, standing_on
 from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 from workers.cloud.ply import read_points, read_triangles
 
@@ -19,13 +19,6 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 _MAX_POINTS = 250_000
-Z_UP = {
-    "z": np.eye(3),
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
-}
-"""Axis of a file that points up -> rotation to z up."""
-"""Rotation of a cloud whose y points up."""
 _NORMAL_NEIGHBOURS = 24
 """Neighbours that a normal is estimated from."""
 _ORIENTED, _OPPOSITE = 25_000, 12_000

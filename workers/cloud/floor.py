@@ -13,6 +13,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+Z_UP = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""Axis of a file that points up -> rotation to z up."""
 _UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _ADULTS_M = (1.2, 2.3)
 """Statures that tell a unit from the others."""
@@ -29,8 +35,6 @@ _LOWEST_SHARE = 0.3
 """Share of the cloud's height in which a floor is searched for."""
 _CLEARANCE_M = 0.015
 """Points so near to the floor are taken away with it: noise of the floor, and soles."""
-_LEVEL_AXES = {"z": "xy", "y": "xz", "x": "yz"}
-"""Axis of a file that points up -> those that lie level once it is z."""
 _VOXEL_M = 0.04
 _PLANE_ROUNDS = 4
 
@@ -41,7 +45,7 @@ def check_units(points: Array, unit: str, up: str) -> None:
     Args:
         points: (n, 3), in metres by the stated unit, z up by the stated axis.
         unit: one of `UNITS_M`.
-        up: the stated axis.
+        up: the stated axis, one of `Z_UP`.
 
     Raises:
         InputError: naming the option that helps.
@@ -60,9 +64,10 @@ def check_units(points: Array, unit: str, up: str) -> None:
             )
     length_m = max(across_m)
     if height_m < least and least < length_m < most:
+        longest = np.abs(Z_UP[up][int(np.argmax(across_m))])
         raise InputError(
             f"the cloud is {length_m:.2f} m long and {height_m:.2f} m high: is it lying down? "
-            f"say which axis points up: --up {_LEVEL_AXES[up][int(np.argmax(across_m))]}"
+            f"say which axis points up: --up {'xyz'[int(np.argmax(longest))]}"
         )
 
 
