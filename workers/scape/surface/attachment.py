@@ -33,6 +33,10 @@ class Attachments:
         """(n, k): values (P, k) of the vertices, interpolated."""
         return np.einsum("nc,nci->ni", self.weights, values[faces[self.triangle]])
 
+    def chosen(self, which: NDArray[np.bool_]) -> Attachments:
+        """Some of the places, by a mask (n,)."""
+        return Attachments(self.triangle[which], self.weights[which])
+
 
 def attached(
     model: BodyModel, vertices: Array, points: Array, near: NDArray[np.integer]

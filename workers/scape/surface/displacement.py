@@ -39,8 +39,7 @@ Index = NDArray[np.intp]
 @dataclass(frozen=True, slots=True)
 class _Round:
     gate_m: float
-    """Largest distance between a point and the vertex next to it. Edges of trunk and limbs are up
-    to 28 mm long, so that the middle of a triangle is 16 mm away from its corners."""
+    """Largest distance between a point and its place on the surface."""
     angle_rad: float
     """Largest angle between their normals."""
     stiffness: float
@@ -54,8 +53,11 @@ class _Round:
 _ROUNDS = (
     _Round(0.030, np.radians(50), 20.0, 30.0),
     _Round(0.020, np.radians(45), 4.0, 3.0),
-    _Round(0.020, np.radians(40), 1.0, 0.2),
+    _Round(0.015, np.radians(40), 1.0, 0.2),
 )
+_REACH_M = 0.030
+"""Largest distance between a point and the vertex next to it. Edges of trunk and limbs are up to
+28 mm long, so that the middle of a triangle is 16 mm away from its corners."""
 _SIGMA_PER_MISMATCH = 3.5
 """Standard deviation of the offsets per mismatch of the points and the model's surface, without the
 points' noise. More than 1, since folds and edges are steeper than a field of one range."""
@@ -118,16 +120,32 @@ class _Readings:
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
 
-    def pairs(
-        self, model: BodyModel, vertices: Array, gate_m: float, angle_rad: float
-    ) -> tuple[Index, Index]:
-        """Readings (n,) near a surface (P, 3), and the vertex next to each."""
-        return self.tracked.pairs(
+    def placed(
+        self,
+        model: BodyModel,
+        vertices: Array,
+        angle_rad: float,
+        *,
+        reach_m: float = _REACH_M,
+        gate_m: float = np.inf,
+    ) -> tuple[Index, Index, Attachments]:
+        """Readings (n,) near a surface (P, 3), the vertex next to each, and its place.
+
+        Args:
+            angle_rad: largest angle between the normals of a reading and of the vertex.
+            reach_m: largest distance between them.
+            gate_m: largest distance of a reading from its place.
+        """
+        used, vertex = self.tracked.pairs(
             vertices,
             vertex_normals(vertices, model.faces),
-            max_distance_m=gate_m,
+            max_distance_m=reach_m,
             max_angle_rad=angle_rad,
         )
+        places = attached(model, vertices, self.points[used], vertex)
+        gap = self.points[used] - places.of(vertices, model.faces)
+        near = np.einsum("ni,ni->n", gap, gap) < gate_m**2
+        return used[near], vertex[near], places.chosen(near)
 
     def away_m(self, used: Index, places: Array) -> Array:
         """(n,): distances of some readings from places (n, 3), along the readings' normals."""
@@ -181,8 +199,9 @@ def fit_surface(
     before: _AtVertices | None = None
     for round_ in _ROUNDS:
         current = vertices + offset
-        used, vertex = readings.pairs(model, current, round_.gate_m, round_.angle_rad)
-        places = attached(model, current, readings.points[used], vertex)
+        used, vertex, places = readings.placed(
+            model, current, round_.angle_rad, gate_m=round_.gate_m
+        )
         away = readings.away_m(used, places.of(vertices, model.faces))
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
@@ -204,8 +223,7 @@ def _examined(
     Args:
         before: what the cloud said at the vertices before the surface was displaced.
     """
-    used, vertex = readings.pairs(model, vertices, _SEEN_M, _ROUNDS[-1].angle_rad)
-    places = attached(model, vertices, readings.points[used], vertex)
+    used, vertex, places = readings.placed(model, vertices, _ROUNDS[-1].angle_rad, reach_m=_SEEN_M)
     away = readings.away_m(used, places.of(vertices, model.faces))
     after = readings.at_vertices(used, vertex, away, len(vertices))
     # The template is finer than the pixels: a vertex between others that have points is seen too.
