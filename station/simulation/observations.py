@@ -57,7 +57,12 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
     def balls(step: str, limit_s: float | None) -> list[BallDetection]:
         found = (
             find_ball(
-                depth * np.float32(DEPTH_SCALE_M), camera, procedure.radius_m, time_s, background
+                depth * np.float32(DEPTH_SCALE_M),
+                camera,
+                procedure.radius_m,
+                time_s,
+                background,
+                held=step == BALL,
             )
             for time_s, depth in timed(step, limit_s, STRIDE)
         )

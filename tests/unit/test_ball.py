@@ -107,6 +107,41 @@ def test_fingers_on_a_distant_ball_do_not_pull_it(camera: CameraCalibration) -> 
     assert np.linalg.norm(away.mean(axis=0)) < 2.0e-3
 
 
+def test_fingers_spread_over_the_ball_do_not_pull_it(camera: CameraCalibration) -> None:
+    """A ball fitted to flat fingers as well hides that they stand out: one of ten was 3.6 mm off,
+    and 2 mm is noise."""
+    right, down, ahead = camera.world_from_camera[:3, :3].T
+    truth = np.array([0.1, 0.0, 1.82])
+    center = transform(camera.world_from_camera, truth)
+    away = []
+    for turn in np.radians(np.arange(0, 360, 60)):
+        grip = np.cos(turn) * right + np.sin(turn) * down
+        hand = center + 0.125 * grip
+        shapes = [ball(center, 0.1), Capsule(hand, hand + 0.02 * grip, 0.042)]
+        for spread in (-0.6, 0.2):
+            side = -np.cos(spread) * ahead - np.sin(spread) * np.cross(grip, ahead)
+            bent, flat = 0.75 * grip + 0.66 * side, 0.15 * grip + side
+            knuckle = center + 0.104 * bent / np.linalg.norm(bent)
+            tip = center + 0.102 * flat / np.linalg.norm(flat)
+            shapes += [Capsule(hand, knuckle, 0.014), Capsule(knuckle, tip, 0.011)]
+        found = [find_ball(image, camera, 0.1, 0.0) for image in images(camera, shapes, 4)]
+        away += [one.center_m - truth for one in found if one is not None]
+    assert len(away) >= 18
+    assert np.quantile(np.linalg.norm(away, axis=1), 0.9) < 3e-3
+
+
+def test_single_losses_leave_the_ball_as_it_is(camera: CameraCalibration) -> None:
+    rng = np.random.default_rng(5)
+    for image in images(camera, [ball(CENTER, 0.1)], 6):
+        whole = find_ball(image, camera, 0.1, 0.0)
+        image[rng.random(image.shape) < 0.005] = 0.0
+        torn = find_ball(image, camera, 0.1, 0.0)
+        assert whole is not None
+        assert torn is not None
+        assert torn.points > 0.9 * whole.points
+        assert np.linalg.norm(torn.center_m - whole.center_m) < 1e-3
+
+
 def test_a_ball_of_another_size_is_found_and_told(camera: CameraCalibration) -> None:
     found = [
         find_ball(image, camera, 0.1, 0.0) for image in images(camera, [ball(CENTER, 0.085)], 6)

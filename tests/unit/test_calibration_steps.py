@@ -94,7 +94,7 @@ def test_no_more_frames_are_looked_at_than_are_worth_it(
         tmp_path, "2026-11-21T10:00:00Z", 0.1, {_CAMERAS[0]: default_rig().cameras[_CAMERAS[0]]}
     )
     image = np.zeros((4, 4), np.uint16)
-    with BallFinder(session, every_frame=True) as looking:
+    with BallFinder(session, every_frame=True, held=True) as looking:
         for start_s in (500.0, 20.0):
             times = [start_s + number / 30.0 for number in range(30)]
             looking.submit(TimedFrame(_CAMERAS[0], time_s, image, 1e-3) for time_s in times)
@@ -127,7 +127,7 @@ def test_frames_of_a_replay_that_wait_are_kept_on_disk(
         tmp_path / "session", "2026-11-21T10:00:00Z", 0.1,
         {_CAMERAS[0]: default_rig().cameras[_CAMERAS[0]]},
     )  # fmt: skip
-    with BallFinder(session, every_frame=True) as looking:
+    with BallFinder(session, every_frame=True, held=True) as looking:
         looking.submit(
             Frame(_CAMERAS[0], seconds, TABLE[image], DEPTH_SCALE_M, file=file)
             for image, (seconds, _, file) in zip(raw, check_recording(recording), strict=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.ball_hands import hand_pixels, surroundings
+from station.calibration.detect.ball_hands import beside_gaps, hand_pixels, surroundings
 from station.calibration.detect.ball_image import (
     INCIDENCE_COSINE,
     ball_image,
@@ -53,11 +53,13 @@ def find_ball(
     radius_m: float,
     time_s: float,
     background_m: Image | None = None,
+    *,
+    held: bool = True,
 ) -> BallDetection | None:
     """The ball in a depth image (h, w), 0 = no reading; None where there is none.
 
     ``background_m`` is the empty booth's (averaged) depth: with it less is searched, and less is
-    mistaken for a ball.
+    mistaken for a ball. ``held``: fingers may lie on the ball.
     """
     inverse = _inverse(depth_m)
     foreground = inverse > 0.0
@@ -67,7 +69,7 @@ def find_ball(
         foreground &= (depth_m < nearest) | (background_m == 0.0)
     best: _Fit | None = None
     for start in candidates(inverse, foreground, camera, radius_m):
-        fit = _fit(inverse, camera, start, radius_m)
+        fit = _fit(inverse, camera, start, radius_m, held)
         if fit is not None and (best is None or fit.unlike(radius_m) < best.unlike(radius_m)):
             best = fit
             if fit.unlike(radius_m) < _ALIKE:
@@ -110,7 +112,9 @@ class _Fit:
         return float(away**2 + (max(self.spread - 1.0, 0.0) / 0.2) ** 2)
 
 
-def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: float) -> _Fit | None:
+def _fit(
+    inverse: Image, camera: CameraCalibration, start: Array, radius_m: float, held: bool
+) -> _Fit | None:
     """The most likely ball near a place, if the pixels say that one is there."""
     center, radius = start.copy(), radius_m
     gate = _START_GATE_M / max(start[2], 0.3) ** 2
@@ -135,6 +139,8 @@ def _fit(inverse: Image, camera: CameraCalibration, start: Array, radius_m: floa
             gate = max(0.6 * gate, _GATE_SIGMAS * 1.3 * RANDOM_SIGMA)
     for _ in range(_STRAY_ROUNDS):
         off = hand_pixels(part, camera, ray, center, radius, radius_m, gate)
+        if held:
+            off |= beside_gaps(part, camera, ray, center, radius_m)
         clean = np.where(off, np.float32(0.0), part)
         for _ in range(2):
             normal, pull, used, seen = normal_equations(clean, ray, center, radius, gate, False)

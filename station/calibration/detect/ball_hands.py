@@ -24,6 +24,11 @@ _RING = (1.1, 1.25)
 """Shares of the radius: a ring outside the flickering silhouette, where a hand is visible."""
 _FINGERS_M = 0.055
 """Visible reach of fingers of 8 cm, bent round a ball, from the hand."""
+_FINGER_M = 0.022
+"""Breadth of a finger: it reaches so far from a gap at its edge, to one side or the other."""
+_GAPS = 3
+"""Missing readings within the averaging window that are an edge: single losses of one pixel in 200
+come so close together a few times in a ball of ten thousand pixels."""
 _FINGERS_SHOW_M = 1.7
 """Up to this distance a finger is as wide as the averaging window that reveals strays."""
 
@@ -65,6 +70,23 @@ def _strays(part: Image, ray: Image, center: Array, radius: float) -> Mask:
     limit = _STRAY_SIGMAS * _STRAY_NOISE * RANDOM_SIGMA / np.sqrt(np.maximum(cosine, 0.2))
     off = seen & (np.abs(mean) > limit)
     return np.asarray(cv2.dilate(off.astype(np.uint8), np.ones(size, np.uint8)) > 0)
+
+
+def beside_gaps(
+    part: Image, camera: CameraCalibration, ray: Image, center: Array, radius: float
+) -> Mask:
+    """Pixels within a finger's breadth of where readings are missing amid the ball.
+
+    A ball alone is seen whole up to the limit of incidence. Readings are missing at the edges of
+    what stands out of it, and these gaps stay where they are when the ball is fitted to the
+    fingers, too, which hides how far they stand out: it has been moved by 5 mm.
+    """
+    cosine = ball_image(ray, center, radius)[1]
+    gaps = ((cosine > INCIDENCE_COSINE) & (part == 0.0)).astype(np.float32)
+    near = cv2.boxFilter(gaps, -1, (_STRAY_BLUR_PX, _STRAY_BLUR_PX), normalize=False)
+    several = ((gaps > 0.0) & (near > _GAPS - 0.5)).astype(np.uint8)
+    apart_px = cv2.distanceTransform(1 - several, cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(apart_px < _FINGER_M * camera.K[0, 0] / center[2])
 
 
 def _held(

@@ -24,15 +24,18 @@ _RESET_S = 1.0
 class BallFinder:
     """Finds the ball of a session in front of its empty booth. Use it in a ``with`` statement."""
 
-    def __init__(self, session: Session, *, every_frame: bool) -> None:
-        """``every_frame``: process each frame that is due, even if the search falls behind."""
+    def __init__(self, session: Session, *, every_frame: bool, held: bool) -> None:
+        """``every_frame``: process each frame that is due, even if the search falls behind.
+
+        ``held``: the ball is in a hand, whose fingers may lie on it.
+        """
         self._radius_m, self._cameras = session.radius_m, session.lensed_cameras()
         self._backgrounds = {
             name: view.depth_m()
             for name in session.cameras
             if (view := session.background(name)) is not None
         }
-        self._every_frame = every_frame
+        self._every_frame, self._held = every_frame, held
         self._due_s: dict[str, float] = {}
         self._pool = ThreadPoolExecutor(_THREADS)
         self._pending: deque[Future[BallDetection | None]] = deque()
@@ -79,4 +82,5 @@ class BallFinder:
             self._radius_m,
             frame.time_s,
             background_m=self._backgrounds.get(frame.camera),
+            held=self._held,
         )

@@ -118,7 +118,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     still: dict[str, list[BallDetection]] = {}
     now_s = time.monotonic()
     give_up_s, settled_s = now_s + _RESTING_S, np.inf
-    with BallFinder(session, every_frame=feed.replays) as finder:
+    with BallFinder(session, every_frame=feed.replays, held=False) as finder:
         while now_s < min(give_up_s, settled_s) and not feed.over:
             finder.submit(feed.newest())
             for ball in finder.found():
@@ -180,7 +180,7 @@ def wave_ball(
         waiting.clear()
 
     began_s = written_s = time.monotonic()
-    with BallFinder(session, every_frame=feed.replays) as finder:
+    with BallFinder(session, every_frame=feed.replays, held=True) as finder:
         try:
             while not feed.over:
                 for frame in feed.newest():
