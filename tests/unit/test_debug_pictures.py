@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from station.core.errors import InputError
 from workers.pictures.debug_pictures import DebugPictures
 from workers.pictures.render import BACKGROUND
 from workers.reconstruct.fit_cli import fit
@@ -62,3 +63,22 @@ def test_every_stage_is_drawn(bundle: Path, tmp_path: Path) -> None:
         assert 0.08 < _ink(pictures / name) < 0.6, name
     # Pictures of a body are as private as its scan.
     assert pictures.stat().st_mode & 0o077 == 0
+
+
+def test_folders_that_cannot_be_made_are_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "nowhere").symlink_to("nothing")
+    (tmp_path / "loop").symlink_to("loop")
+    places = (
+        ("--out", "file/result", "cannot be made"),
+        ("--out", "nowhere", "exists already"),
+        ("--out", "loop/result", "cannot be made"),
+        ("--debug", "file", "cannot be made"),
+        ("--debug", "loop/pictures", "cannot be made"),
+    )
+    for option, place, words in places:
+        options = {"--out": tmp_path / "out", option: tmp_path / place}
+        listed = [str(word) for pair in options.items() for word in pair]
+        with pytest.raises(InputError, match=f"{words}.*{option}"):
+            CliRunner().invoke(fit, ["bundle", *listed], catch_exceptions=False)
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import get_args
 import click
 
 from station.core.errors import InputError
-from station.core.files import publish_folder
+from station.core.files import PRIVATE_FOLDER_MODE, publish_folder
 from workers.scape.fit.fit import Method
 
 
@@ -60,10 +61,7 @@ def fit(
     """
     if (bundle is None) == (cloud is None):
         raise click.UsageError("give either a bundle or --cloud FILE")
-    if out_folder.exists():
-        raise InputError(f"{out_folder} exists already; name a new folder with --out")
-    if debug_folder is not None and debug_folder.exists() and not debug_folder.is_dir():
-        raise InputError(f"{debug_folder} is not a folder; name one for the pictures with --debug")
+    _check_folders(out_folder, debug_folder)
     from workers.cloud.cloud_file import read_cloud
     from workers.reconstruct import job
     from workers.scape.fit.observer import Observer, unobserved
@@ -81,7 +79,6 @@ def fit(
         if not quiet:
             click.echo(f"{step} {100 * share:3.0f} %", err=True)
 
-    out_folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=".fit-", dir=out_folder.parent))
     try:
         if bundle is not None:
@@ -106,3 +103,27 @@ def fit(
     click.echo(f"{out_folder}: {summary.status}")
     for reason in summary.reasons:
         click.echo(f"  {reason}")
+
+
+def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:
+    """Make what the new folders lie in, before any work is done for them.
+
+    Raises:
+        InputError: one of them cannot be made.
+    """
+    # A link that leads nowhere does not exist, but a folder cannot take its name.
+    if os.path.lexists(out_folder):
+        raise InputError(f"{out_folder} exists already; name a new folder with --out")
+    for folder, option in ((out_folder.parent, "--out"), (debug_folder, "--debug")):
+        if folder is None:
+            continue
+        # Pictures of a body are as private as its scan.
+        mode = PRIVATE_FOLDER_MODE if option == "--debug" else 0o777
+        try:
+            folder.mkdir(mode, parents=True, exist_ok=True)
+        except OSError as cause:
+            raise InputError(
+                f"{folder} cannot be made ({cause.strerror}); name another folder with {option}"
+            ) from None
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InputError(f"{folder} cannot be written; name another folder with {option}")
