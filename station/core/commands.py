@@ -27,6 +27,7 @@ _OPTIONAL = {
     "or pip install 'body-booth[simulation]'",
 }
 """A library that may be missing -> the remedy."""
+_NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
 
 
 class LazyGroup(click.Group):
@@ -65,6 +66,13 @@ def run(group: click.Group) -> None:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
     except OSError as error:
+        if error.filename and error.errno in _NO_ACCESS:
+            click.echo(
+                f"error: {error.filename} cannot be used ({error.strerror}); check its name, and "
+                "that this user may read and write there",
+                err=True,
+            )
+            sys.exit(1)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
             raise
         where = f": {error.filename}" if error.filename else ""

@@ -57,6 +57,21 @@ def test_a_full_disk_is_one_line(
     assert told.count("\n") == 1
 
 
+def test_a_place_without_access_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @click.group(invoke_without_command=True)
+    def look() -> None:
+        Path("/" + 300 * "a").stat()
+
+    monkeypatch.setattr(sys, "argv", ["look"])
+    with pytest.raises(SystemExit, match="1"):
+        run(look)
+    told = capsys.readouterr().err
+    assert "cannot be used (File name too long); check its name" in told
+    assert told.count("\n") == 1
+
+
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     """A traceback once told an operator nothing about the file that was missing."""
     missing = tmp_path / "booth.toml"
