@@ -156,6 +156,10 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(
             f"{path}: a bundle may have at most {MAX_CAMERAS} cameras with {MAX_FRAMES} frames each"
         )
+    for name in ("scan_id", "created", "label", "booth"):
+        # Half of a UTF-16 pair: JSON may escape it, but no file of the result can hold it.
+        if any("\ud800" <= c <= "\udfff" for c in getattr(bundle, name)):
+            raise BundleError(f"{path}: {name} is not valid text; correct it, or scan again")
     if not (math.isfinite(bundle.spread_s_max) and bundle.spread_s_max >= 0.0):
         raise BundleError(f"{path}: spread_s_max is {bundle.spread_s_max}; scan again")
     if not (np.isfinite(scale) and 0.0 < scale < 0.1):
