@@ -91,6 +91,27 @@ def test_the_axis_that_points_up_is_named(
     assert np.ptp(read_cloud(path, up).points[:, 2]) == pytest.approx(1.75, abs=0.01)
 
 
+@pytest.mark.parametrize("length", [0.0, 10.0, np.nan])
+def test_normals_that_are_no_directions_are_estimated(tmp_path: Path, length: float) -> None:
+    points = _person(np.random.default_rng(2))
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(np.tile([0.0, 0.0, length], (len(points), 1)))
+    o3d.io.write_point_cloud(tmp_path / "a.ply", cloud)
+    normals = read_cloud(tmp_path / "a.ply", "z").normals
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert np.abs(normals[:, 2]).mean() < 0.3
+
+
+def test_a_header_that_claims_too_many_points_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    path.write_text(
+        "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 9999999999999\n"
+        "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 9999999999999\nDATA binary\n" + 100 * "x"
+    )
+    with pytest.raises(InputError, match="claims more points"):
+        read_cloud(path, "z")
+
+
 def test_a_cloud_in_millimetres_is_read_as_such(tmp_path: Path) -> None:
     points = _person(np.random.default_rng(2))
     path = _written(tmp_path / "a.ply", 1000.0 * points)

@@ -21,6 +21,8 @@ Faces = NDArray[np.int32]
 _MAX_POINTS = 250_000
 _NORMAL_NEIGHBOURS = 24
 """Neighbours that a normal is estimated from."""
+_UNIT = 0.01
+"""Deviation from 1 of a normal's length in a file: formats round to a few digits."""
 _ORIENTED, _OPPOSITE = 25_000, 12_000
 """Points whose normals are oriented, and points among which the body's other side is searched."""
 _DEPTHS_M = (0.06, 0.09, 0.13, 0.18, 0.24, 0.30)
@@ -76,7 +78,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     person = standing_on(np.asarray(cloud.points))
     if person is not None:
         cloud = cloud.select_by_index(np.flatnonzero(person[0]))
-    if not cloud.has_normals():
+    if not _has_unit_normals(cloud):
         _estimate_normals(cloud, path)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     middle = np.median(points, axis=0)
@@ -124,7 +126,12 @@ def _read(path: Path) -> o3d.geometry.PointCloud:
     if path.suffix.lower() != ".ply":
         # Open3D's warnings would repeat the error that is raised.
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            return o3d.io.read_point_cloud(path)
+            try:
+                return o3d.io.read_point_cloud(path)
+            except MemoryError:
+                raise InputError(
+                    f"{path} claims more points than memory holds; repair it, or give a .ply"
+                ) from None
     try:
         points, normals = read_points(path)
     except (OSError, ValueError) as cause:
@@ -135,6 +142,12 @@ def _read(path: Path) -> o3d.geometry.PointCloud:
     if normals is not None:
         cloud.normals = o3d.utility.Vector3dVector(normals)
     return cloud
+
+
+def _has_unit_normals(cloud: o3d.geometry.PointCloud) -> bool:
+    """Whether every point has a direction: programs that know none write zeros."""
+    lengths = np.linalg.norm(np.asarray(cloud.normals), axis=1)
+    return cloud.has_normals() and bool((np.abs(lengths - 1.0) < _UNIT).all())
 
 
 def _estimate_normals(cloud: o3d.geometry.PointCloud, path: Path) -> None:
