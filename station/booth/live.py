@@ -1,14 +1,17 @@
-"""The live cloud: one frameset as points in the world, for watching only."""
+"""The live cloud: one frameset as points in the world, to be watched and to see that somebody is
+there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from station.booth.frameset import Frameset
+from station.core.bundle import LEAST_READINGS
+from station.core.config import Volume
 from station.core.errors import BoothError
 from station.core.lens import rays
 from station.core.rig import Rig
@@ -17,21 +20,37 @@ from station.messaging.intake import LiveFrame
 _STRIDE_PX = 6
 _LOOK_PERIOD_S = 2.0
 """Period of looking for a new calibration."""
+_FLOOR_REACH_M = 0.3
+"""Height above the floor below which single readings may be the floor's, or shoes left behind."""
 
 
-def merged_points(
-    rig: Rig, depths: Mapping[str, NDArray[np.uint16]], scale_m: float
-) -> NDArray[np.float32]:
-    """Points (n, 3) of every sixth pixel of each camera, world frame, metres."""
-    clouds = []
-    for name, depth in depths.items():
-        camera = rig.cameras[name]
-        z = depth[::_STRIDE_PX, ::_STRIDE_PX] * np.float32(scale_m)
+def frameset_points(rig: Rig, found: Frameset[LiveFrame]) -> NDArray[np.float32]:
+    """Points (n, 3) of every sixth pixel of each camera that the calibration describes, world
+    frame, metres.
+    """
+    clouds = [np.empty((0, 3), np.float32)]
+    for name, frame in found.frames.items():
+        camera = rig.cameras.get(name)
+        if camera is None or frame.depth.shape != (camera.height, camera.width):
+            continue
+        z = frame.depth[::_STRIDE_PX, ::_STRIDE_PX] * np.float32(frame.header.depth_scale_m)
         seen = z > 0
         points = rays(camera)[::_STRIDE_PX, ::_STRIDE_PX][seen] * z[seen, None]
         pose = camera.world_from_camera
         clouds.append((points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
-    return np.concatenate(clouds) if clouds else np.empty((0, 3), np.float32)
+    return np.concatenate(clouds)
+
+
+def is_empty(volume: Volume, points: NDArray[np.float32]) -> bool:
+    """Whether nobody stands in the volume, by its `frameset_points` (n, 3).
+
+    A reading out of 36 is looked at, so a booth counts as empty at the same density of readings as
+    in the reconstruction, which would refuse the scan when the person is gone.
+    """
+    low, high = np.array(volume.min_m), np.array(volume.max_m)
+    low[2] = max(low[2], _FLOOR_REACH_M)
+    inside = ((points > low) & (points < high)).all(axis=1)
+    return bool(np.count_nonzero(inside) * _STRIDE_PX**2 < LEAST_READINGS)
 
 
 class LiveCloud:
@@ -54,14 +73,7 @@ class LiveCloud:
         rig = self.rig
         if rig is None:
             return None
-        frames = {name: frame for name, frame in found.frames.items() if name in rig.cameras}
-        fitting = {
-            name: frame.depth
-            for name, frame in frames.items()
-            if frame.depth.shape == (rig.cameras[name].height, rig.cameras[name].width)
-        }
-        scale_m = next(iter(found.frames.values())).header.depth_scale_m
-        return merged_points(rig, fitting, scale_m)
+        return frameset_points(rig, found)
 
     def _look(self) -> None:
         """Load the calibration if its file is another one than before."""

@@ -15,11 +15,12 @@ import zmq
 from station.booth.collection import LATE, Collection, Order
 from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
-from station.booth.live import LiveCloud
+from station.booth.live import LiveCloud, frameset_points, is_empty
 from station.booth.scan_writer import Ended, ScanWriter, Started
 from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
+from station.core.bundle import NOBODY
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
@@ -103,9 +104,9 @@ class SyncProcess:
         if collection is not None:
             complete = collection.add(found, now_s)
             self._tell(collection, "writing" if complete else "capturing")
-            if complete and (wrong := self._wrong_sensors(collection.rig)):
+            if complete and (reason := self._useless(collection.rig, found)):
                 self._collection = None
-                self._fail(collection.order, "; ".join(wrong))
+                self._fail(collection.order, reason)
             elif complete:
                 self._collection = None
                 self._writing[collection.order.scan_id] = collection.order
@@ -165,6 +166,13 @@ class SyncProcess:
             for name in self._names
             if (trouble := self._checks[name].trouble(now_s))
         ]
+
+    def _useless(self, rig: Rig, last: Frameset[LiveFrame]) -> str:
+        """Reason why a scan that ended with a frameset shows no body; empty if it may show one."""
+        if wrong := self._wrong_sensors(rig):
+            return "; ".join(wrong)
+        empty = is_empty(self._config.volume, frameset_points(rig, last))
+        return NOBODY if empty else ""
 
     def _wrong_sensors(self, rig: Rig) -> list[str]:
         known = {name: rig.cameras[name].serial for name in self._names if name in rig.cameras}

@@ -33,6 +33,12 @@ _ENCODERS = 2
 _PNG_SLACK_BYTES = 1 << 16
 """Allowance beyond twice the pixels' own size, which not even a PNG of noise reaches."""
 MAX_CAMERAS, MAX_FRAMES = 64, 1000
+LEAST_READINGS = 2000
+"""Readings of all cameras in the booth's volume below which nobody stands there."""
+NOBODY = (
+    "the booth is empty: the cameras see nobody in its volume; "
+    "ask the person to stand on the mark, or check volume in booth.toml"
+)
 _MAX_COUNT = 1 << 63
 
 

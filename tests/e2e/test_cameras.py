@@ -48,6 +48,19 @@ def test_a_camera_that_goes_silent_is_named_within_a_second(
     assert "back-lower" in refused.stderr
 
 
+def test_an_empty_booth_fails_the_scan_before_the_person_may_leave(
+    make_station: Callable[..., Station],
+) -> None:
+    corner = "[volume]\nmin_m = [0.8, 0.6, 0.0]\nmax_m = [0.95, 0.75, 2.2]\n"
+    station = make_station(f"{corner}[workers]\ncount = 0", _recorded)
+    assert station.command("start").returncode == 0
+    done = station.command("scan")
+    assert done.returncode == 1
+    assert "the booth is empty" in done.stderr
+    assert "may leave" not in done.stdout + done.stderr
+    assert not list((station.config.parent / "spool/queue").iterdir())
+
+
 def test_a_camera_that_dies_in_a_scan_fails_it_by_name(
     make_station: Callable[..., Station],
 ) -> None:

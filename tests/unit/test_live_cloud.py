@@ -7,10 +7,16 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
-from station.booth.live import LiveCloud
+from station.booth.live import LiveCloud, frameset_points, is_empty
+from station.core.config import Volume
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.simulation.scene import Mesh, load_mesh
+from station.simulation.sensor import SimulatedBooth, VirtualCamera
 
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 K = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]])
 
 
@@ -49,3 +55,26 @@ def test_a_calibration_that_cannot_be_read_leaves_the_last_one(tmp_path: Path) -
     assert live.points(_frameset(), 0.0) is not None
     path.write_text("{")
     assert live.points(_frameset(), 10.0) is not None
+
+
+def _counts_as_empty(body: Mesh | None, cameras: int = 4) -> bool:
+    """Whether the booth with this body counts as empty, as its first so many cameras see it."""
+    booth = SimulatedBooth(seed=8)
+    header = SimpleNamespace(depth_scale_m=DEPTH_SCALE_M)
+    frames = {}
+    for name in list(booth.rig.cameras)[:cameras]:
+        (frame,) = VirtualCamera(booth, name, body).frames(1)
+        frames[name] = SimpleNamespace(header=header, depth=TABLE[frame.raw])
+    found = cast(Any, SimpleNamespace(frames=frames))
+    return is_empty(Volume(), frameset_points(booth.rig, found))
+
+
+def test_a_booth_with_nobody_in_it_is_empty() -> None:
+    assert _counts_as_empty(None)
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_a_child_in_the_booth_is_somebody(cameras: int) -> None:
+    adult = load_mesh(BODIES / "ann.npz")
+    child = Mesh(adult.vertices * (0.5, 0.5, 0.6), adult.faces, adult.dark)
+    assert not _counts_as_empty(child, cameras)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from station.core.bundle import LEAST_READINGS, NOBODY
 from station.core.errors import InputError
 from workers.cloud.observed import Finding
 from workers.cloud.people import count_people
@@ -18,8 +19,6 @@ Mask = NDArray[np.bool_]
 _VOXEL_M = 0.04
 """Cell size for connected components."""
 _MIN_READINGS_PER_CELL = 3
-_MIN_POINTS = 2000
-"""Points below which the booth counts as empty."""
 _SECOND_PERSON_SHARE = 0.15
 _SECOND_PERSON_HEIGHT_M = 1.1
 """Another component with this share of the largest one's points and this height is a second person;
@@ -44,11 +43,8 @@ def one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
         InputError: there is nobody in the booth.
     """
     everything = np.concatenate(points)
-    if len(everything) < _MIN_POINTS:
-        raise InputError(
-            "the booth is empty: the cameras see nobody in its volume; "
-            "ask the person to stand on the mark, or check volume in booth.toml"
-        )
+    if len(everything) < LEAST_READINGS:
+        raise InputError(NOBODY)
     # One coordinate per row: minima along long rows are fast.
     rows = everything.T.copy()
     low = rows.min(axis=1, keepdims=True) - 2 * _VOXEL_M
