@@ -43,7 +43,7 @@ def main() -> int:
         options = ("--body", arguments.body, "--out", booth, "--driver", driver)
         calibration = ("--calibration", str(WAVING_S))
         record = [*STATION, "record-virtual", *options, *calibration]
-        subprocess.run(record, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(record, check=True)
     environment = {**os.environ, "BOOTH_CONFIG": str(config)}
     if not (booth / "calibration.json").exists():
         calibrate = [*STATION, "calibrate", "--recordings", str(booth / PROCEDURE)]

@@ -315,8 +315,6 @@ def show_result(path: str) -> None:
         if row["value_m"] is None:
             click.echo(f"  {row['name']:<{width}}    not measured")
             continue
-        low, high = row["interval95_m"]
-        half_mm = 500 * (high - low)
-        click.echo(f"  {row['name']:<{width}} {100 * row['value_m']:7.1f} cm  ± {half_mm:.0f} mm")
-    seconds = json.loads((folder / "result.json").read_text())["seconds"]
-    click.echo("\n  " + "  ".join(f"{step} {value:.2f} s" for step, value in seconds.items()))
+        low, high = (100 * end for end in row["interval95_m"])
+        value = 100 * row["value_m"]
+        click.echo(f"  {row['name']:<{width}} {value:7.1f} cm  {low:6.1f} to {high:5.1f}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +29,9 @@ _PROCESSES = 2
 
 @click.command()
 @click.option(
-    "--body", type=click.Path(path_type=Path), required=True, help=".npz, .ply or .obj in metres"
+    "--body",
+    type=click.Path(path_type=Path),
+    help=".npz, .ply or .obj in metres; without it, the booth is empty",
 )
 @click.option(
     "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="folder to write"
@@ -52,7 +54,7 @@ _PROCESSES = 2
     "errors of their own, and no calibration.json is written",
 )
 def record_virtual(
-    body: Path,
+    body: Path | None,
     out_folder: Path,
     seed: int,
     frames: int,
@@ -66,6 +68,7 @@ def record_virtual(
     Examples:
       station record-virtual --body station/simulation/bodies/ann.npz --out demo/booth
       station run --config demo/booth/booth.toml
+      station record-virtual --out demo/empty
       station record-virtual --body ann.npz --out demo/booth --calibration 60
       station calibrate --config demo/booth/booth.toml --recordings demo/booth/procedure
     """
@@ -88,9 +91,10 @@ def record_virtual(
     # Spawned: a forked child would share the ray caster's threads.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(_PROCESSES, mp_context=context) as pool:
-        running = {what: pool.submit(job) for what, job in jobs.items()}
-        for what, job in running.items():
-            click.echo(f"recorded {what}: {job.result()} frames")
+        click.echo(f"rendering {len(jobs)} recordings, {_PROCESSES} at a time")
+        running = {pool.submit(job): what for what, job in jobs.items()}
+        for done, job in enumerate(as_completed(running), 1):
+            click.echo(f"{done:3} of {len(jobs)}: {running[job]}, {job.result()} frames")
     lines = ["# A virtual booth: four replayed Kinects.", ""]
     for name in booth.rig.cameras:
         lines += ["[[cameras]]", f'name = "{name}"', f'driver = "{driver}"']
@@ -103,9 +107,9 @@ def record_virtual(
 
 
 def _record_person(
-    booth: SimulatedBooth, name: str, body: Path, folder: Path, frames: int, passes: int
+    booth: SimulatedBooth, name: str, body: Path | None, folder: Path, frames: int, passes: int
 ) -> int:
-    camera = VirtualCamera(booth, name, load_mesh(body))
+    camera = VirtualCamera(booth, name, load_mesh(body) if body else None)
     return write_recording(folder, recorded_frames(camera, frames), tick_hz=TICK_HZ, passes=passes)
 
 

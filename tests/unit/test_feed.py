@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from station.calibration.guide.feed import RecordedClock, gather_frames, replayed_feed
+from station.calibration.guide.feed import Feed, RecordedClock, gather_frames, replayed_feed
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError, FormatError
 from station.messaging.messages import FrameHeader
@@ -105,3 +106,22 @@ def test_a_station_that_does_not_run_is_said(tmp_path: Path) -> None:
     )
     with live_feed(config) as feed, pytest.raises(BoothError, match="station run"):
         feed.cameras(1.0)
+
+
+@pytest.mark.parametrize(
+    ("victims", "remedy"),
+    [(("front",), "check its cable"), (("front", "back"), "computer is busy")],
+)
+def test_cameras_that_fall_silent_together_are_not_told_to_check_a_cable(
+    tmp_path: Path, victims: tuple[str, ...], remedy: str
+) -> None:
+    """On a starved computer four cables were suspected."""
+    config = _config("front", "back")
+    config = config.model_copy(
+        update={"runtime": config.runtime.model_copy(update={"folder": tmp_path})}
+    )
+    with Feed(config) as feed:
+        for name in ("front", "back"):
+            feed._intake.last_frame_s[name] = 0.0 if name in victims else time.monotonic()
+        with pytest.raises(CalibrationError, match=remedy):
+            feed.frames(0.01)

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -177,7 +177,7 @@ class Feed:
         ]:
             if time.monotonic() > deadline_s:
                 why = "; ".join(f"camera {name} {self._why(name)}" for name in missing)
-                raise CalibrationError(f"{why}; check its cable, see station status")
+                raise CalibrationError(f"{why}; {self._remedy(missing)}")
             self._receive(_POLL_S)
         return {
             name: uncalibrated(
@@ -205,14 +205,13 @@ class Feed:
         """
         self._receive(timeout_s)
         now_s = time.monotonic()
-        limit_s = self._config.sync.silent_after_s
-        for name, seen_s in self._intake.last_frame_s.items():
-            ended = name in self._clocks and self._clocks[name].over
-            if now_s - seen_s > limit_s and not ended:
-                raise CalibrationError(
-                    f"camera {name} {self._why(name)}; what was seen so far is kept, check its "
-                    "cable and run the same command again"
-                )
+        limit_s, last_s = self._config.sync.silent_after_s, self._intake.last_frame_s
+        ended = {name for name, clock in self._clocks.items() if clock.over}
+        silent = [name for name in last_s if now_s - last_s[name] > limit_s and name not in ended]
+        if silent:
+            why = "; ".join(f"camera {name} {self._why(name)}" for name in silent)
+            kept = "what was seen so far is kept; run the same command again"
+            raise CalibrationError(f"{why}; {self._remedy(silent)}; {kept}")
         taken = list(self._waiting)
         self._waiting.clear()
         return taken
@@ -228,6 +227,13 @@ class Feed:
 
     def _why(self, name: str) -> str:
         return f"gives no frames{self._intake.why(name)}"
+
+    def _remedy(self, silent: Sequence[str]) -> str:
+        if self.replays:
+            return "stop other programs: the computer may be too busy for a replay"
+        if 1 < len(silent) == len(self._names):
+            return "stop other programs if the computer is busy; check the cameras' power supply"
+        return "check its cable, see station status"
 
     def _receive(self, timeout_s: float) -> None:
         """Take all that has come; wait for the first of it."""
