@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
+from workers.scape.fit.posture import arms_inside, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
-from workers.scape.fit.verdict import PartReport, arms_inside, judge, lost_parts
+from workers.scape.fit.verdict import PartReport, judge, lost_parts, scattered
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 
@@ -70,6 +71,35 @@ def test_an_arm_that_the_fit_put_into_the_trunk_is_named(model: BodyModel) -> No
     assert verdict.status == "rescan"
     assert "the left forearm was not found" in verdict.reasons[0]
     assert set(verdict.missing) == {"upper_arm_left", "forearm_left", "hand_left"}
+
+
+def _rotations(model: BodyModel, part: str, twist: tuple[float, float, float]) -> Array:
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index(part)] = twist
+    return model.absolute_rotations(twists)
+
+
+def test_a_head_bent_onto_the_chest_was_not_found(model: BodyModel) -> None:
+    """Without a reading of the head the fit bent the neck to the stump, and all of it was seen."""
+    assert head_turned(model, _rotations(model, "neck", (-0.4, 0.1, 0.0))) == {}
+    lost = head_turned(model, _rotations(model, "neck", (-1.0, 0.3, 0.0)))
+    verdict = _verdict(model, lost, {})
+    assert verdict.reasons == ("the head was not found: look straight ahead",)
+    assert verdict.missing == ("head",)
+
+
+def test_a_lean_and_scattered_readings_are_reasons(model: BodyModel) -> None:
+    root = model.part_names[int(np.flatnonzero(model.part_parents < 0)[0])]
+    upright = _rotations(model, root, (0.1, 0.0, 2.0))
+    assert [*leaning(model, upright), *scattered(0.002)] == []
+    findings = [*leaning(model, _rotations(model, root, (0.5, 0.0, 0.0))), *scattered(0.0123)]
+    sides = {"front": 0.9, "back": 0.9}
+    verdict = judge((), sides, findings, {}, 1.75, np.zeros(model.beta_count), {})
+    assert verdict.status == "rescan"
+    assert verdict.reasons == (
+        "the person leans by 29 degrees: stand upright",
+        "the readings lie 12 mm from the body; run: station check",
+    )
 
 
 def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:

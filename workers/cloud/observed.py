@@ -24,7 +24,7 @@ class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind" or "frames-missing"."""
+    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or "scatter"."""
     camera: str | None
     value: float | None
     message: str

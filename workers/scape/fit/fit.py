@@ -32,15 +32,16 @@ from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
+from workers.scape.fit.posture import arms_inside, head_turned, leaning
 from workers.scape.fit.sampling import Sampling
 from workers.scape.fit.unmatched import Patch, unmatched_patches
 from workers.scape.fit.verdict import (
     PartReport,
     Verdict,
-    arms_inside,
     judge,
     lost_parts,
     report_parts,
+    scattered,
     sides_seen,
     unexplained_share,
 )
@@ -229,7 +230,13 @@ def separate_limbs(
         vertices = untangled(model, vertices, fit.reference, surface.measured)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
-    lost = {**arms_inside(model, fit.vertices), **lost_parts(model, fit.patches)}
+    rotations = fit.state.rotations
+    findings = [*findings, *leaning(model, rotations), *scattered(rms_m)]
+    lost = {
+        **head_turned(model, rotations),
+        **arms_inside(model, fit.vertices),
+        **lost_parts(model, fit.patches),
+    }
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m

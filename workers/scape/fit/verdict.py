@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
-from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
@@ -61,9 +60,9 @@ half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck")
 _CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
 """Parts of a limb, outwards."""
-_INSIDE = 0.3
-"""Share of a forearm inside the body from which the arm was not found: 0 in sound scans, 0.54 and
-more where the fit put the arm into the trunk, whose points then pass for the arm's."""
+_SCATTER_M = 0.004
+"""Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
+sound scans, 12 where each point is 30 mm off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,8 +182,8 @@ def judge(
 
     Args:
         sides: what `sides_seen` gives.
-        findings: what preprocessing noticed; each is a reason.
-        lost: what `lost_parts` and `arms_inside` give.
+        findings: what preprocessing, `scattered` and `leaning` noticed; each is a reason.
+        lost: what `lost_parts`, `arms_inside` and `head_turned` give.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
     """
@@ -259,18 +258,12 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
     return reasons
 
 
-def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
-    """Reasons by the forearm that lies inside the body.
-
-    Args:
-        vertices: (P, 3), the fitted surface before crossings are mended.
-    """
-    shares = shares_inside(model, vertices, [f"forearm_{side}" for side in _LIMBS])
-    return {
-        part: f"the {part_in_words(part)} was not found: hold both arms away from the body"
-        for part, share in shares.items()
-        if share > _INSIDE
-    }
+def scattered(rms_m: float) -> list[Finding]:
+    """The finding that the readings lie too far from the surface, where they do."""
+    if rms_m <= _SCATTER_M:
+        return []
+    message = f"the readings lie {1e3 * rms_m:.0f} mm from the body; run: station check"
+    return [Finding("scatter", None, rms_m, message)]
 
 
 def _with_rest_of_limbs(

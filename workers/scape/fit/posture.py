@@ -1,0 +1,63 @@
+"""Fitted poses that no standing person has: what the fit did with a part that it did not find."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from station.core.geometry import so3_log
+from workers.cloud.observed import Finding
+from workers.scape.evidence.inside import shares_inside
+from workers.scape.fit.verdict import part_in_words
+from workers.scape.model.body_model import BodyModel
+
+Array = NDArray[np.float64]
+
+_LEAN_RAD = 0.26
+"""Lean of the trunk from which it is not a person who stands: up to 0.13 in 50 sound scans."""
+_HEAD_TURN_RAD = 0.8
+"""Turn of the head against the chest from which it was not found: up to 0.4 in 50 sound scans, 1.5
+to 2.4 where the readings of head and neck are missing and the neck bends to what is left."""
+_INSIDE = 0.3
+"""Share of a forearm inside the body from which the arm was not found: 0 in sound scans, 0.54 and
+more where the fit put the arm into the trunk, whose points then pass for the arm's."""
+
+
+def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
+    """Reasons by the forearm that lies inside the body.
+
+    Args:
+        vertices: (P, 3), the fitted surface before crossings are mended.
+    """
+    shares = shares_inside(model, vertices, [f"forearm_{side}" for side in ("left", "right")])
+    return {
+        part: f"the {part_in_words(part)} was not found: hold both arms away from the body"
+        for part, share in shares.items()
+        if share > _INSIDE
+    }
+
+
+def head_turned(model: BodyModel, rotations: Array) -> dict[str, str]:
+    """The reason by the head where it looks away from where the chest points.
+
+    Args:
+        rotations: (L, 3, 3), the parts' rotations from the neutral pose to the world.
+    """
+    chest, head = (rotations[model.part_names.index(part)] for part in ("chest", "head"))
+    if np.linalg.norm(so3_log(chest.T @ head)) < _HEAD_TURN_RAD:
+        return {}
+    return {"head": "the head was not found: look straight ahead"}
+
+
+def leaning(model: BodyModel, rotations: Array) -> list[Finding]:
+    """The finding that the trunk leans, where it does.
+
+    Args:
+        rotations: (L, 3, 3), as in `head_turned`.
+    """
+    upwards = sum(rotations[model.part_names.index(part)][:, 2] for part in ("pelvis", "chest"))
+    lean = float(np.arctan2(np.linalg.norm(upwards[:2]), upwards[2]))
+    if lean <= _LEAN_RAD:
+        return []
+    message = f"the person leans by {np.degrees(lean):.0f} degrees: stand upright"
+    return [Finding("leaning", None, lean, message)]
