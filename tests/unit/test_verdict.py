@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from workers.cloud.observed import PointCloud
 from workers.scape.fit.posture import arms_inside, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
-from workers.scape.fit.verdict import PartReport, judge, lost_parts, scattered
+from workers.scape.fit.verdict import PartReport, judge, lost_parts
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 
@@ -45,7 +45,7 @@ def _elbow_bent(model: BodyModel, degrees: float) -> Array:
 
 def _verdict(model: BodyModel, lost: dict[str, str], shifts: dict[str, float]):  # type: ignore[no-untyped-def]
     sides = {"front": 0.9, "back": 0.9}
-    return judge((), sides, (), lost, 1.75, np.zeros(model.beta_count), shifts)
+    return judge((), sides, (), lost, 1.75, np.zeros(model.beta_count), shifts, 1e-3)
 
 
 def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:
@@ -88,24 +88,26 @@ def test_a_head_bent_onto_the_chest_was_not_found(model: BodyModel) -> None:
     assert verdict.missing == ("head",)
 
 
-def test_a_lean_and_scattered_readings_are_reasons(model: BodyModel) -> None:
+def test_a_lean_is_a_reason(model: BodyModel) -> None:
     root = model.part_names[int(np.flatnonzero(model.part_parents < 0)[0])]
-    upright = _rotations(model, root, (0.1, 0.0, 2.0))
-    assert [*leaning(model, upright), *scattered(0.002)] == []
-    findings = [*leaning(model, _rotations(model, root, (0.5, 0.0, 0.0))), *scattered(0.0123)]
-    sides = {"front": 0.9, "back": 0.9}
-    verdict = judge((), sides, findings, {}, 1.75, np.zeros(model.beta_count), {})
-    assert verdict.status == "rescan"
-    assert verdict.reasons == (
-        "the person leans by 29 degrees: stand upright",
-        "the readings lie 12 mm from the body; run: station check",
-    )
+    assert leaning(model, _rotations(model, root, (0.1, 0.0, 2.0))) == []
+    (finding,) = leaning(model, _rotations(model, root, (0.5, 0.0, 0.0)))
+    assert finding.message == "the person leans by 29 degrees: stand upright"
+
+
+def test_readings_that_scatter_are_the_reason_where_there_is_no_other(model: BodyModel) -> None:
+    scatter = "the readings lie 12 mm from the body; run: station check"
+    for stature_m, first in ((1.75, scatter), (1.0, "the person is 1.00 m tall")):
+        sides, beta = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count)
+        verdict = judge((), sides, (), {}, stature_m, beta, {}, 0.0123)
+        assert len(verdict.reasons) == 1
+        assert verdict.reasons[0].startswith(first)
 
 
 def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
     sides = {"front": 0.9, "back": 0.9}
     parts = [PartReport("thigh_right", 0.1, 1e-3), PartReport("shin_right", 0.4, 1e-3)]
-    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert set(verdict.missing) == {"thigh_right", "shin_right", "foot_right"}
 
 
@@ -116,12 +118,12 @@ def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> 
         PartReport(name, share, 1e-3) for name, share in zip(names, (0.9, 0.3, 0.0), strict=True)
     ]
     sides = {"front": 0.9, "back": 0.9}
-    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert verdict.reasons == ("the cameras saw only 0 % of the left hand",)
     assert set(verdict.missing) == {"forearm_left", "hand_left"}
     # Readings beside the body are the missing limb's.
     beside = {"": "338 cm2 of the scan do not belong to the person"}
-    verdict = judge(parts, sides, (), beside, 1.75, np.zeros(model.beta_count), {})
+    verdict = judge(parts, sides, (), beside, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert set(verdict.missing) == set(names)
 
 
@@ -130,8 +132,15 @@ def test_a_part_far_from_its_points_is_missing_in_a_bad_scan_alone(model: BodyMo
     sides = {"front": 0.9, "back": 0.9}
     for coverage, missing in ((0.9, ()), (0.0, ("hand_right", "hand_left"))):
         parts = [PartReport("hand_left", 0.3, 6.5e-3), PartReport("hand_right", coverage, 1e-3)]
-        verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+        verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
         assert set(verdict.missing) == set(missing)
+
+
+def test_many_unseen_parts_are_counted(model: BodyModel) -> None:
+    parts = [PartReport(name, 0.05, 1e-3) for name in model.part_names[:8]]
+    verdict = judge(parts, {}, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
+    assert verdict.reasons == ("the cameras hardly saw 8 of 8 parts of the body",)
+    assert set(verdict.missing) >= {part.name for part in parts}
 
 
 def test_two_limbs_that_do_not_match_leave_nothing_to_measure(model: BodyModel) -> None:
@@ -142,9 +151,11 @@ def test_two_limbs_that_do_not_match_leave_nothing_to_measure(model: BodyModel) 
         f"foot_{side}": f"the {side} foot does not match the scan" for side in ("left", "right")
     }
     for lost, everything in ((feet, True), ({"foot_left": feet["foot_left"]}, False)):
-        verdict = judge(parts, sides, (), lost, 1.75, np.zeros(model.beta_count), {})
+        verdict = judge(parts, sides, (), lost, 1.75, np.zeros(model.beta_count), {}, 1e-3)
         assert ({"chest", "forearm_right"} <= set(verdict.missing)) == everything
         assert "foot_left" in verdict.missing
+        whole = "too much of the scan does not match a body: nothing can be measured"
+        assert (verdict.reasons[0] == whole) == everything
 
 
 def test_folds_and_stray_readings_are_no_lost_limb(model: BodyModel) -> None:
@@ -185,7 +196,7 @@ def test_a_small_patch_widens_the_skin_beside_it(
 def test_a_person_of_whom_one_side_is_missing_is_not_measured(model: BodyModel) -> None:
     parts = [PartReport("abdomen", 0.48, 1e-3), PartReport("hand_left", 0.85, 1e-3)]
     sides = {"front": 0.9, "back": 0.02}
-    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert found.status == "rescan"
     assert found.missing == ("abdomen",)
 
@@ -194,7 +205,7 @@ def test_a_person_whose_left_side_is_missing_is_not_measured(model: BodyModel) -
     """A leg beside the other one may be seen even so: the trunk says that half of it is missing."""
     parts = [PartReport("abdomen", 0.55, 1e-3), PartReport("thigh_left", 0.3, 1e-3)]
     sides = {"front": 0.7, "back": 0.7, "left side": 0.5, "right side": 0.8}
-    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {})
+    found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert found.reasons == ("the cameras saw only 50 % of the person's left side",)
     assert found.missing == ("abdomen", "thigh_left")
 

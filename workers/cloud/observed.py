@@ -24,7 +24,7 @@ class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or "scatter"."""
+    """"motion", "two-people", "camera-blind", "frames-missing" or "leaning"."""
     camera: str | None
     value: float | None
     message: str

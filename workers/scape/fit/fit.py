@@ -41,7 +41,6 @@ from workers.scape.fit.verdict import (
     judge,
     lost_parts,
     report_parts,
-    scattered,
     sides_seen,
     unexplained_share,
 )
@@ -231,7 +230,7 @@ def separate_limbs(
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
-    findings = [*findings, *leaning(model, rotations), *scattered(rms_m)]
+    findings = [*findings, *leaning(model, rotations)]
     lost = {
         **head_turned(model, rotations),
         **arms_inside(model, fit.vertices),
@@ -240,7 +239,7 @@ def separate_limbs(
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts)
+    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts, rms_m)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

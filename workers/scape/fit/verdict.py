@@ -177,19 +177,50 @@ def judge(
     stature_m: float,
     beta: Array,
     camera_shifts_m: dict[str, float],
+    rms_m: float,
 ) -> Verdict:
     """Decide whether to scan again.
 
     Args:
         sides: what `sides_seen` gives.
-        findings: what preprocessing, `scattered` and `leaning` noticed; each is a reason.
+        findings: what preprocessing and `leaning` noticed; each is a reason.
         lost: what `lost_parts`, `arms_inside` and `head_turned` give.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
+        rms_m: distance of the points from the surface.
     """
-    reasons = [finding.message for finding in findings]
-    reasons += list(lost.values())[:_PARTS_NAMED]
+    unseen = _unseen_parts(parts)
+    moved, notes = _moved_cameras(camera_shifts_m)
+    halves = _unseen_sides(sides)
+    everywhere = _limbs_lost(lost) > 1
+    reasons = [finding.message for finding in findings] + moved + _unlike_people(stature_m, beta)
+    if everywhere:
+        reasons.append("too much of the scan does not match a body: nothing can be measured")
+    reasons += [*halves, *list(lost.values())[:_PARTS_NAMED]]
+    if len(unseen) > _PARTS_NAMED:
+        reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
+    else:
+        reasons += unseen.values()
+    if not reasons and rms_m > _SCATTER_M:
+        reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; run: station check")
+    missing = [*(name for name in lost if name), *unseen]
+    if reasons:
+        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
+    missing = _with_rest_of_limbs(missing, lost, parts)
+    if everywhere:
+        missing += [part.name for part in parts]
+    elif halves or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
+        missing += [
+            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
+        ]
+    return Verdict(
+        "rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(dict.fromkeys(missing))
+    )
+
+
+def _unlike_people(stature_m: float, beta: Array) -> list[str]:
     low, high = _STATURES_M
+    reasons = []
     if not low < stature_m < high:
         reasons.append(
             f"the person is {stature_m:.2f} m tall; only adults of {low:.2f} to {high:.2f} m can "
@@ -197,40 +228,41 @@ def judge(
         )
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         reasons.append("what stands in the booth does not look like a person")
-    halved = False
+    return reasons
+
+
+def _unseen_sides(sides: Mapping[str, float]) -> list[str]:
     best = max((sides.get(f"{name} side", 0.0) for name in _LIMBS), default=0.0)
-    for side, share in sides.items():
-        lateral = side.endswith("side") and share < _OTHER_SIDE * best
-        if share < _MIN_COVERAGE or lateral:
-            reasons.append(f"the cameras saw only {100 * share:.0f} % of the person's {side}")
-            halved = True
-    missing = [name for name in lost if name]
-    unseen: set[str] = set()
+    return [
+        f"the cameras saw only {100 * share:.0f} % of the person's {side}"
+        for side, share in sides.items()
+        if share < _MIN_COVERAGE or (side.endswith("side") and share < _OTHER_SIDE * best)
+    ]
+
+
+def _unseen_parts(parts: Sequence[PartReport]) -> dict[str, str]:
+    """Reasons by the part that the cameras hardly saw."""
+    reasons = {}
     for part in parts:
-        found = _part_reasons(part)
-        reasons += found
-        if found:
-            missing.append(part.name)
-            unseen.add(part.name)
+        extremity = part.name.startswith(_EXTREMITIES)
+        if part.coverage < (_MIN_EXTREMITY_COVERAGE if extremity else _MIN_COVERAGE):
+            words = part_in_words(part.name)
+            reasons[part.name] = f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"
+    return reasons
+
+
+def _moved_cameras(shifts_m: Mapping[str, float]) -> tuple[list[str], list[str]]:
+    """Reasons and remarks by how far the fit moved each camera's points."""
     noticed, unusable = _CAMERA_SHIFTS_M
+    reasons: list[str] = []
     notes: list[str] = []
-    for camera, shift in camera_shifts_m.items():
+    for camera, shift in shifts_m.items():
         if shift > noticed:
             (reasons if shift > unusable else notes).append(
                 f"camera {camera} has moved by {1e3 * shift:.0f} mm or more since the calibration; "
                 "run: station check"
             )
-    if reasons:
-        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
-    halved |= any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen for side in _LIMBS)
-    missing = _with_rest_of_limbs(missing, lost, parts)
-    if halved:
-        missing += [
-            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
-        ]
-    return Verdict(
-        "rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(dict.fromkeys(missing))
-    )
+    return reasons, notes
 
 
 def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
@@ -258,12 +290,14 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
     return reasons
 
 
-def scattered(rms_m: float) -> list[Finding]:
-    """The finding that the readings lie too far from the surface, where they do."""
-    if rms_m <= _SCATTER_M:
-        return []
-    message = f"the readings lie {1e3 * rms_m:.0f} mm from the body; run: station check"
-    return [Finding("scatter", None, rms_m, message)]
+def _limbs() -> list[list[str]]:
+    """Parts of each limb, outwards."""
+    return [[f"{part}_{side}" for part in chain] for chain in _CHAINS for side in _LIMBS]
+
+
+def _limbs_lost(lost: Mapping[str, str]) -> int:
+    """Number of limbs that do not match the scan: with two, a body was fitted to something else."""
+    return sum(not lost.keys().isdisjoint(limb) for limb in _limbs())
 
 
 def _with_rest_of_limbs(
@@ -271,13 +305,10 @@ def _with_rest_of_limbs(
 ) -> list[str]:
     """Missing parts, what is farther out, and what is next to them and was hardly seen: nothing
     says how it points. All of a limb where its middle, or something beside the body, does not match
-    the scan; all of the body where two limbs do not."""
+    the scan."""
     coverage = {part.name: part.coverage for part in parts}
-    limbs = [[f"{part}_{side}" for part in chain] for chain in _CHAINS for side in _LIMBS]
-    if sum(not lost.keys().isdisjoint(limb) for limb in limbs) > 1:
-        return [*missing, *coverage]
     found = list(missing)
-    for limb in limbs:
+    for limb in _limbs():
         first = next((place for place, part in enumerate(limb) if part in missing), len(limb))
         if first == len(limb):
             continue
@@ -285,14 +316,6 @@ def _with_rest_of_limbs(
             first -= 1
         found += limb if limb[1] in lost or "" in lost else limb[first:]
     return found
-
-
-def _part_reasons(part: PartReport) -> list[str]:
-    extremity = part.name.startswith(_EXTREMITIES)
-    if part.coverage < (_MIN_EXTREMITY_COVERAGE if extremity else _MIN_COVERAGE):
-        words = part_in_words(part.name)
-        return [f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"]
-    return []
 
 
 def part_in_words(part: str) -> str:
