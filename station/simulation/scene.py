@@ -12,7 +12,7 @@ import open3d as o3d
 from numpy.typing import ArrayLike, NDArray
 
 from station.core.errors import InputError
-from station.core.geometry import rigid, se3_exp, transform
+from station.core.geometry import rigid, transform
 from station.core.lens import rays as lens_rays
 from station.core.rig import CameraCalibration, DepthCorrection, Rig
 from station.simulation.noise import BASELINE_M, TrueView
@@ -266,6 +266,15 @@ class VirtualScene:
         return np.asarray((1.0 - reach) * distance < _SHADOW_TOLERANCE_M)
 
 
-def moved(world_from_camera: Array, shift_m: float, turn_rad: float) -> Array:
-    """A camera that somebody bumped into: shifted sideways and turned about its x axis."""
-    return np.asarray(world_from_camera @ se3_exp((turn_rad, 0.0, 0.0, shift_m, 0.0, 0.0)))
+def bumped(shift_m: float, turn_rad: float) -> Array:
+    """Twist (6,), rotation first, of a camera that somebody bumped into: shifted sideways and
+    turned about its x axis."""
+    return np.array((turn_rad, 0.0, 0.0, shift_m, 0.0, 0.0))
+
+
+def astray(shift_m: float, turn_rad: float, rng: np.random.Generator) -> Array:
+    """Twist (6,), rotation first, of these sizes in directions that the generator chooses."""
+    turn, shift = rng.standard_normal((2, 3))
+    turn *= turn_rad / np.linalg.norm(turn)
+    shift *= shift_m / np.linalg.norm(shift)
+    return np.concatenate([turn, shift])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.errors import InputError
+from station.core.geometry import se3_exp
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration, Rig
 from station.sensors.recording import RecordedFrame
@@ -22,7 +23,6 @@ from station.simulation.scene import (
     bent,
     booth_walls,
     default_rig,
-    moved,
     uneven,
 )
 
@@ -50,8 +50,8 @@ class SimulatedBooth:
     """Size of each unit's systematic depth error at 2 m."""
     drop_rate: float = 0.0
     """Share of the frames that are lost."""
-    moved_cameras: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Camera -> (metres, radians) by which it stands off its calibration."""
+    moved_cameras: Mapping[str, Array] = field(default_factory=dict)
+    """Camera -> twist (6,), rotation first, by which it stands off its calibration."""
     dead_cameras: Collection[str] = ()
     """Cameras that give no frame."""
     clutter: Sequence[Mesh] = ()
@@ -164,7 +164,7 @@ class VirtualCamera:
         if lean_m not in self._views:
             pose = camera.world_from_camera
             if camera.name in booth.moved_cameras:
-                pose = moved(pose, *booth.moved_cameras[camera.name])
+                pose = pose @ se3_exp(booth.moved_cameras[camera.name])
             meshes = booth.fixtures
             if self._body is not None:
                 meshes.append(_leaning(self._body, lean_m))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from station.calibration.drift.people import Evidence
 from station.core.bundle import read_bundle
-from station.simulation.scene import load_mesh
+from station.simulation.scene import bumped, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.scape.fit.fit import fit_overlapping, single_threaded_blas
@@ -24,7 +24,7 @@ BODY = Path(__file__).parents[2] / "station/simulation/bodies/ben.npz"
 SHIFT_M, TURN_RAD = -0.003, float(np.radians(-0.2))
 
 
-def _motions(folder: Path, moved: dict[str, tuple[float, float]]) -> dict[str, NDArray[np.float64]]:
+def _motions(folder: Path, moved: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     booth = SimulatedBooth(seed=77, moved_cameras=moved)
     bundle = read_bundle(render_bundle(load_mesh(BODY), folder, booth))
     scan = preprocess(bundle, None)
@@ -43,7 +43,7 @@ def _motions(folder: Path, moved: dict[str, tuple[float, float]]) -> dict[str, N
 
 def test_a_moved_camera_asks_for_its_motion(tmp_path: Path) -> None:
     before = _motions(tmp_path / "before", {})
-    after = _motions(tmp_path / "after", {"front-upper": (SHIFT_M, TURN_RAD)})
+    after = _motions(tmp_path / "after", {"front-upper": bumped(SHIFT_M, TURN_RAD)})
     change = after["front-upper"] - before["front-upper"]
     assert abs(change[0] - TURN_RAD) < np.radians(0.05)
     assert np.abs(change[1:3]).max() < np.radians(0.05)

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 from fit_cases import on_the_mark
+from numpy.typing import NDArray
 from room import first_with_room
 
 from station.calibration.drift.people import ENOUGH, Drift, Evidence, find_drift
 from station.core.bundle import read_bundle
-from station.simulation.scene import default_rig
+from station.simulation.scene import bumped, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import warm_up
@@ -27,13 +28,13 @@ from workers.scape.fit.observer import unobserved
 from workers.scape.learn.database import BodyDatabase
 from workers.scape.model.body_model import BodyModel
 
+Array = NDArray[np.float64]
+
 SHIFT_M, TURN_RAD = 0.003, float(np.radians(0.2))
 _SEED, _POOL = 51, 96
 
 
-def evidence(
-    model: BodyModel, moved: Mapping[str, tuple[float, float]], first: int
-) -> Iterator[Evidence | None]:
+def evidence(model: BodyModel, moved: Mapping[str, Array], first: int) -> Iterator[Evidence | None]:
     """Evidence of one person's scan after another; None of those that are not accepted."""
     database = BodyDatabase()
     shapes = database.sample("test", _POOL, _SEED)
@@ -57,7 +58,7 @@ def evidence(
 
 
 def after(
-    model: BodyModel, moved: Mapping[str, tuple[float, float]], args: argparse.Namespace
+    model: BodyModel, moved: Mapping[str, Array], args: argparse.Namespace
 ) -> tuple[Drift | None, int]:
     """Verdict after so many accepted scans, and the number of those that were taken for them."""
     taken: list[Evidence] = []
@@ -86,7 +87,9 @@ def main() -> None:
     )
     for chosen in args.camera or ("none", *default_rig().cameras):
         camera = None if chosen == "none" else chosen
-        drift, tried = after(model, {} if camera is None else {camera: (SHIFT_M, TURN_RAD)}, args)
+        drift, tried = after(
+            model, {} if camera is None else {camera: bumped(SHIFT_M, TURN_RAD)}, args
+        )
         named = None if drift is None else drift.camera
         offered = drift is not None and drift.confirmed
         verdict = "met" if named == camera and offered == (camera is not None) else "MISSED"

@@ -17,7 +17,7 @@ from unlike_sensor import UnlikeSensor
 
 from station.core.geometry import rigid, so3_exp
 from station.core.rig import Rig
-from station.simulation.scene import Mesh, box, chair, default_rig, look_at
+from station.simulation.scene import Mesh, box, bumped, chair, default_rig, look_at
 from station.simulation.sensor import SimulatedBooth
 from workers.cloud.observed import PointCloud
 from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
@@ -151,8 +151,12 @@ def hard_cases(bodies: TestBodies) -> Iterator[Case]:
         ("no front-upper", body, replace(day, dead_cameras=("front-upper",))),
         ("no back-lower", body, replace(day, dead_cameras=("back-lower",))),
         ("a fifth dropped", body, replace(day, drop_rate=0.2)),
-        ("camera 5 mm off", body, replace(day, moved_cameras={"back-upper": (0.005, 0.0)})),
-        ("camera 0.3 deg off", body, replace(day, moved_cameras={"back-lower": (0.0, knocked)})),
+        ("camera 5 mm off", body, replace(day, moved_cameras={"back-upper": bumped(0.005, 0.0)})),
+        (
+            "camera 0.3 deg off",
+            body,
+            replace(day, moved_cameras={"back-lower": bumped(0.0, knocked)}),
+        ),
         ("dark hair and briefs", Mesh(body.vertices, body.faces, dark), day),
         ("sway 10 mm", body, replace(day, sway_m=0.01)),
         ("chair and walls", body, replace(day, clutter=chair((0.75, 0.45)))),

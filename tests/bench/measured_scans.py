@@ -16,7 +16,7 @@ from unlike_bodies import UnlikeBodies, UnlikeSplit
 from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
-from station.simulation.scene import Mesh, default_rig
+from station.simulation.scene import Mesh, astray, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import measure_body
@@ -104,7 +104,7 @@ class Studio:
                 seed=seed,
                 sway_m=float(rng.uniform(0.0, 0.003)),
                 moved_cameras={
-                    camera: (rng.uniform(0.0, 1e-3), np.radians(rng.uniform(0.0, 0.05)))
+                    camera: astray(rng.uniform(0.0, 1e-3), np.radians(rng.uniform(0.0, 0.05)), rng)
                     for camera in default_rig().cameras
                 },
             )

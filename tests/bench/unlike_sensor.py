@@ -18,7 +18,7 @@ from station.core.bundle import CapturedFrame, write_bundle
 from station.core.geometry import se3_exp
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import Rig
-from station.simulation.scene import Mesh
+from station.simulation.scene import Mesh, astray
 from station.simulation.sensor import FRAME_RATE_HZ, TICK_HZ, SimulatedBooth, VirtualCamera
 
 Array = NDArray[np.float64]
@@ -89,10 +89,7 @@ def _misplaced(rig: Rig, sensor: UnlikeSensor, rng: np.random.Generator) -> Rig:
     """The true places of the cameras."""
     cameras = {}
     for name, camera in rig.cameras.items():
-        turn, shift = rng.standard_normal((2, 3))
-        turn *= sensor.turn_rad / np.linalg.norm(turn)
-        shift *= sensor.shift_m / np.linalg.norm(shift)
-        pose = camera.world_from_camera @ se3_exp(np.concatenate([turn, shift]))
+        pose = camera.world_from_camera @ se3_exp(astray(sensor.shift_m, sensor.turn_rad, rng))
         cameras[name] = replace(camera, world_from_camera=pose)
     return replace(rig, cameras=cameras)
 

@@ -8,29 +8,31 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from running_station import Station
 
 from station.calibration.detect.scene import static_view
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import write_recording
-from station.simulation.scene import Mesh, fixed_posts, load_mesh
+from station.simulation.scene import Mesh, bumped, fixed_posts, load_mesh
 from station.simulation.sensor import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
 
 STATION = (sys.executable, "-m", "station.cli")
 BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
-BUMPED = {"front-upper": (0.006, 0.004)}
+BUMPED = {"front-upper": bumped(0.006, 0.004)}
 """6 mm and 0.23 degrees."""
 
 
-def _record(folder: Path, body: Mesh | None, moved: dict[str, tuple[float, float]]) -> None:
+def _record(folder: Path, body: Mesh | None, moved: dict[str, NDArray[np.float64]]) -> None:
     booth = SimulatedBooth(seed=9, clutter=fixed_posts(), moved_cameras=moved, sway_m=0.0)
     camera = VirtualCamera(booth, folder.name, body)
     write_recording(folder, recorded_frames(camera, 12), tick_hz=TICK_HZ, passes=200)
 
 
 @pytest.fixture(scope="module")
-def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bumped_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of one camera after somebody bumped into it."""
     folder = tmp_path_factory.mktemp("bumped") / "front-upper"
     _record(folder, load_mesh(BODY), BUMPED)
@@ -64,11 +66,11 @@ def _recorded(text: str) -> str:
 
 
 def test_a_scan_is_refused_when_a_camera_has_moved(
-    make_station: Callable[..., Station], booth: Path, bumped: Path, calibrated: Path
+    make_station: Callable[..., Station], booth: Path, bumped_recording: Path, calibrated: Path
 ) -> None:
     station = make_station(
         "[workers]\ncount = 0",
-        lambda text: _recorded(text).replace(f"{booth}/front-upper", str(bumped)),
+        lambda text: _recorded(text).replace(f"{booth}/front-upper", str(bumped_recording)),
     )
     assert calibrated.exists()
     assert station.command("start").returncode == 0
