@@ -185,10 +185,12 @@ def test_a_head_that_nobody_saw_end_has_a_height_of_its_own_uncertainty(
 ) -> None:
     """A man came out 14 mm too tall with no wall in range behind his head, and was sure of it."""
 
+    nowhere = np.zeros(model.vertex_count, bool)
+
     def sigma_m(view: CameraView, fitted: np.ndarray) -> float:
         local = (rays(UPPER) * view.depth_m[..., None])[view.depth_m > 0].astype(np.float64)
         pose = view.calibration.world_from_camera
-        return crown_sigma_m(model, [view], [pose], fitted, transform(pose, local))
+        return crown_sigma_m(model, [view], [pose], fitted, transform(pose, local), nowhere)
 
     assert sigma_m(_view(model, body), body) == 0.0
     open_air = _view(model, body, walls=False)
@@ -202,5 +204,8 @@ def test_a_scanner_that_sees_the_top_of_a_head_adds_little(
     model: BodyModel, body: np.ndarray
 ) -> None:
     dense = body[model.faces].mean(axis=1)
-    assert crown_sigma_m(model, [], [], body, np.concatenate([body, dense])) <= 0.003
-    assert crown_sigma_m(model, [], [], body, body[body[:, 2] < 1.2]) == pytest.approx(0.03)
+    nothing, face = np.zeros(len(body), bool), np.ones(len(body), bool)
+    assert crown_sigma_m(model, [], [], body, np.concatenate([body, dense]), nothing) <= 0.003
+    low = body[body[:, 2] < 1.2]
+    assert crown_sigma_m(model, [], [], body, low, nothing) == pytest.approx(0.03)
+    assert crown_sigma_m(model, [], [], body, low, face) == pytest.approx(0.011)

@@ -81,7 +81,8 @@ def test_a_job_tells_the_measurements(
 
     monkeypatch.setattr(job, "measure_body", measure)
     monkeypatch.setattr(job, "measure_standing", measure)
-    monkeypatch.setattr(job, "patch_sigma_m", lambda *_: None)
+    for skin in ("patch_sigma_m", "hidden_head_sigma"):
+        monkeypatch.setattr(job, skin, lambda *_: np.zeros(3))
     surface = SimpleNamespace(sigma_m=np.zeros(3), seen=np.ones(3, bool))
     fit = SimpleNamespace(
         surface=surface, crown_sigma_m=3e-3, patches=(), vertices=np.zeros((3, 3)), state=None

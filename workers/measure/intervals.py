@@ -94,9 +94,9 @@ class ScanErrors:
     """Girths, by the same."""
     crown_sigma_m: float = 0.0
     """Top of the head."""
-    patch_sigma_m: Array | None = None
-    """(P,): the surface beside patches of the scan that it does not explain. An error that is seen,
-    so that no learned gain applies to it; None for none."""
+    skin_sigma_m: Array | None = None
+    """(P,): the surface beside patches of the scan that it does not explain, and of a head that
+    hair hides. No learned gain applies to it; None for none."""
 
     def of_contents(self, volume_m3: float, surface_m2: float, height_m: float) -> Contents:
         """Standard deviations of volume and surface, as shares of them.
@@ -275,8 +275,8 @@ def intervals(
         if pose == "standard":
             model = replace(model, bias=0.0)
         sigma, further = line_sigma(trace, vertex_sigma_m), scan_errors.of(trace.definition)
-        if scan_errors.patch_sigma_m is not None:
-            further = float(np.hypot(further, line_sigma(trace, scan_errors.patch_sigma_m)))
+        if scan_errors.skin_sigma_m is not None:
+            further = float(np.hypot(further, line_sigma(trace, scan_errors.skin_sigma_m)))
         found.append(model.interval(value, sigma, further))
     return found
 

@@ -43,6 +43,7 @@ from workers.scape.fit.unmatched import patch_sigma_m
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
+from workers.scape.surface.uncertainty import hidden_head_sigma
 
 Progress = Callable[[str, float], None]
 """Called with the step's name and the share of it that is done, 0 to 1."""
@@ -194,9 +195,11 @@ def scan_errors(
     Args:
         predicted: errors of the calibration; None if it does not say.
     """
-    errors = ScanErrors(
-        crown_sigma_m=fit.crown_sigma_m, patch_sigma_m=patch_sigma_m(model, fit.patches)
+    skin = np.hypot(
+        patch_sigma_m(model, fit.patches),
+        hidden_head_sigma(model, fit.surface.seen, fit.crown_sigma_m),
     )
+    errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m, skin_sigma_m=skin)
     if predicted is None:
         return errors
     return replace(

@@ -197,7 +197,9 @@ def fit_overlapping(
         crown = partial(crown_rows, model, scan.views, cameras.poses(scan.views))
         surface = fit_surface(model, reference, cloud, crown)
     poses = cameras.poses(scan.views)
-    crown_sigma = crown_sigma_m(model, scan.views, poses, surface.vertices, cloud.points)
+    crown_sigma = crown_sigma_m(
+        model, scan.views, poses, surface.vertices, cloud.points, surface.seen
+    )
     patches = unmatched_patches(model, surface.vertices, cloud)
     return OverlappingFit(
         state=state,

@@ -44,6 +44,9 @@ _MAX_BETA_NORM = 3.5
 """Largest length of beta at the start."""
 _STATURE_QUANTILE = 0.9995
 """Quantile of the points' heights that is taken for the stature."""
+_HIDDEN_M = 0.06
+"""Height of the head that dark hair may hide. A start that is too tall settles; from one that is
+too short the face stays up to 4 cm below its place."""
 _TRUNK_HEIGHTS = (0.35, 0.75)
 """Heights of the trunk, as shares of the stature."""
 _MIN_TRUNK_POINTS = 50
@@ -108,7 +111,7 @@ def starting_states(
         cloud: (m, 3), a denser one that shows the feet.
     """
     stature = float(np.quantile(points[:, 2], _STATURE_QUANTILE))
-    state = replace(model.neutral_state(), beta=stature_beta(model, stature))
+    state = replace(model.neutral_state(), beta=stature_beta(model, stature + _HIDDEN_M))
     low, high = (share * stature for share in _TRUNK_HEIGHTS)
     trunk = points[(points[:, 2] > low) & (points[:, 2] < high)]
     center = np.median(trunk if len(trunk) > _MIN_TRUNK_POINTS else points, axis=0)

@@ -23,7 +23,8 @@ _HALF_COVERAGE = 0.6
 missing: of one half alone cameras see up to a half of it."""
 _LIMBS = ("left", "right")
 _MIN_EXTREMITY_COVERAGE = 0.10
-"""The same for hands, feet, shoulders and the neck, which hide behind other parts."""
+"""The same for hands, feet, shoulders and the neck, which hide behind other parts, and for the
+head, of which dark hair hides all but the face."""
 _LOST_PATCH_M2 = 0.0040
 """Least area of a patch of the scan farther than 15 mm from the surface that makes a scan unusable:
 lost limbs leave 66 to 205 cm^2, folds and hair of sound scans of real people up to 11 cm^2."""
@@ -57,7 +58,7 @@ side's normals. Flanks hide behind arms, so what faces them less counts too."""
 _OTHER_SIDE = 0.75
 """Share of the left side's coverage that the right side has at least, and the other way round: of
 half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
-_EXTREMITIES = ("hand", "foot", "shoulder", "neck")
+_EXTREMITIES = ("hand", "foot", "shoulder", "neck", "head")
 _CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
 """Parts of a limb, outwards."""
 _SCATTER_M = 0.004

@@ -39,6 +39,11 @@ _USUAL_GAP_M = 0.04
 _DRIFT = 0.01
 """Growth of a limb's standard deviation with the distance from readings, beyond the field's range:
 a joint that is known to 0.6 degrees."""
+_HIDDEN_HEAD = 1.5
+"""Standard deviation below hair per that of the head's top: where dark hair hides all but the face,
+head girths of the model's own family err by 12 mm rms."""
+_TOP_M = 0.05
+"""Height of the top of the head, whose uncertainty counts by itself."""
 _FARTHEST_M = 1.0
 """Distances to readings count up to this."""
 
@@ -61,6 +66,22 @@ def surface_sigma(model: BodyModel, seen: Mask, mismatch_m: Array, observed: Mas
     usual = model.vertex_sigma_m**2 * _unknown_share(np.maximum(away - _USUAL_GAP_M, 0.0))
     drift = _DRIFT * np.maximum(away - RANGE_M, 0.0)
     return np.asarray(np.sqrt(further + usual + drift**2))
+
+
+def hidden_head_sigma(model: BodyModel, seen: Mask, crown_sigma_m: float) -> Array:
+    """Standard deviation (P,) of a head below a top that no camera saw: hair hides its skin, too.
+
+    Args:
+        seen: (P,): readings lie on the vertex or next to it.
+        crown_sigma_m: of the top; 0 where it was seen.
+    """
+    sigma_m = np.zeros(len(seen))
+    if crown_sigma_m > 0.0 and seen.any():
+        head = model.part_of_vertex == model.part_names.index("head")
+        head &= model.mean[:, 2] < model.mean[head, 2].max() - _TOP_M
+        away = offset_prior(model).distance_m(seen)[head]
+        sigma_m[head] = _HIDDEN_HEAD * crown_sigma_m * np.sqrt(_unknown_share(away))
+    return sigma_m
 
 
 def _unknown_share(away_m: Array) -> Array:
