@@ -12,6 +12,8 @@ import pytest
 
 from station.core.bundle import read_bundle
 from station.core.geometry import so3_exp
+from station.simulation.scene import Mesh, load_mesh
+from station.simulation.sensor import render_bundle
 from workers.cloud.cloud_file import _outwards, read_cloud
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
@@ -182,3 +184,21 @@ def test_half_a_body_is_no_confident_one(model: BodyModel) -> None:
     verdict = fit_body(model, Preprocessed(cloud, (), ())).verdict
     assert verdict.status == "rescan"
     assert any("% of the person's back" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize("name", ["ann", "ben", "cleo"])
+def test_dark_hair_leaves_the_face_in_its_place(
+    model: BodyModel, tmp_path: Path, name: str
+) -> None:
+    """The scan was to be taken again, although the next would show no more of the head."""
+    body = load_mesh(BODIES / f"{name}.npz")
+    head = model.part_of_vertex == model.part_names.index("head")
+    low, high = model.mean[head, 2].min(), model.mean[head, 2].max()
+    behind = model.mean[:, 1] > np.median(model.mean[head, 1])
+    hair = head & ((model.mean[:, 2] > low + 0.7 * (high - low)) | behind)
+    dark = Mesh(body.vertices, body.faces, hair[body.faces].all(axis=1))
+    found = fit_body(model, preprocess(read_bundle(render_bundle(dark, tmp_path / "scan"))))
+    assert found.verdict.status == "ok"
+    off = (found.vertices - body.vertices)[head & ~hair].mean(axis=0)
+    assert np.abs(off).max() < 0.012
+    assert abs(found.vertices[:, 2].max() - body.vertices[:, 2].max()) < 1.96 * found.crown_sigma_m

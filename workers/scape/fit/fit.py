@@ -27,7 +27,7 @@ from workers.scape.evidence.crown import crown_rows, crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
 from workers.scape.fit.hands import place_hands
-from workers.scape.fit.initial import starting_states
+from workers.scape.fit.initial import is_head_hidden, starting_states, taller
 from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
@@ -282,16 +282,19 @@ def _best_start(
     observer: Observer,
 ) -> JointResult:
     """Fit from the best start, and from others as long as too many points stay unexplained."""
-    best, least = None, np.inf
+    best, least, first = None, np.inf, starts[0]
     cameras = CameraCorrections.build(cloud, views)
     for start in starts[:_MAX_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
         left = unexplained_share(model, coarse.vertices, cloud)
         if left < least:
-            best, least = coarse, left
+            best, least, first = coarse, left, start
         if least < _EXPLAINED:
             break
     assert best is not None
+    if is_head_hidden(model, best.vertices, cloud.points):
+        start = taller(model, first)
+        best = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
     done, total = 0, len(MIDDLE) + len(FINE)
     hands = sampling.hands
     for schedule in (MIDDLE, FINE):
