@@ -145,10 +145,10 @@ def read_bundle(folder: Path) -> Bundle:
         scale = float(document["depth_scale_m"])
         bundle = Bundle(
             folder=folder,
-            scan_id=str(document["scan_id"]),
-            created=str(document["created"]),
-            label=str(document.get("label", "")),
-            booth=str(document.get("booth", "")),
+            scan_id=_text("scan_id", document["scan_id"]),
+            created=_text("created", document["created"]),
+            label=_text("label", document.get("label", "")),
+            booth=_text("booth", document.get("booth", "")),
             depth_scale_m=scale,
             rig=rig,
             frames=frames,
@@ -162,10 +162,6 @@ def read_bundle(folder: Path) -> Bundle:
         raise BundleError(
             f"{path}: a bundle may have at most {MAX_CAMERAS} cameras with {MAX_FRAMES} frames each"
         )
-    for name in ("scan_id", "created", "label", "booth"):
-        # Half of a UTF-16 pair: JSON may escape it, but no file of the result can hold it.
-        if any("\ud800" <= c <= "\udfff" for c in getattr(bundle, name)):
-            raise BundleError(f"{path}: {name} is not valid text; correct it, or scan again")
     if not (math.isfinite(bundle.spread_s_max) and bundle.spread_s_max >= 0.0):
         raise BundleError(f"{path}: spread_s_max is {bundle.spread_s_max}; scan again")
     if not (np.isfinite(scale) and 0.0 < scale < 0.1):
@@ -182,6 +178,13 @@ def read_bundle(folder: Path) -> Bundle:
                 "calibrate the booth again"
             )
     return bundle
+
+
+def _text(name: str, found: object) -> str:
+    # Half of a UTF-16 pair: JSON may escape it, but no file of the result can hold it.
+    if not isinstance(found, str) or any("\ud800" <= c <= "\udfff" for c in found):
+        raise ValueError(f"{name} is not valid text")
+    return found
 
 
 def _record(entry: Mapping[str, Any]) -> FrameRecord:

@@ -101,6 +101,8 @@ def test_a_bundle_cannot_reach_outside_its_folder(bundle_folder: Path) -> None:
         ({"depth_scale_m": 1}, "depth_scale_m is 1"),
         ({"sync": None}, "scan again"),
         ({"label": "order \ud800"}, "label is not valid text"),
+        ({"label": {"order": 7}}, "label is not valid text"),
+        ({"scan_id": 7}, "scan_id is not valid text"),
     ],
 )
 def test_contradictions_are_refused(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from station.core.errors import InputError
+from station.core.errors import FormatError, InputError
 from workers.export.meshes import obj_mesh, ply_mesh
 from workers.export.origin import Origin
 from workers.export.result import measurements_document
@@ -107,3 +107,24 @@ def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_
     ):
         with pytest.raises(InputError, match=words):
             CliRunner().invoke(measure, [str(tmp_path / source)], catch_exceptions=False)
+
+
+@pytest.mark.parametrize(
+    ("key", "content"),
+    [
+        ("measurements", None),
+        ("measurements", [{"name": "height", "value_m": "tall", "interval95_m": [1.0, 2.0]}]),
+        ("measurements", [{"name": "height", "value_m": 1.7, "interval95_m": None}]),
+        ("differences", [{"name": "arm", "value_m": None, "interval95_m": None}]),
+        ("volume_m3", {"value": float("nan"), "interval95": [0.0, 1.0]}),
+        ("verdict", "ok"),
+        ("label", 5),
+    ],
+)
+def test_a_result_that_was_changed_is_refused_by_its_place(
+    model: BodyModel, tmp_path: Path, key: str, content: object
+) -> None:
+    document = measurements_document(Origin("s1"), measure_body(model, model.mean), VERDICT)
+    (tmp_path / "measurements.json").write_text(json.dumps({**document, key: content}))
+    with pytest.raises(FormatError, match=f"measurements.json: {key}"):
+        CliRunner().invoke(measure, [str(tmp_path)], catch_exceptions=False)

@@ -97,12 +97,30 @@ def fit(
                 progress=show,
                 observer=observer,
             )
-        publish_folder(temporary, out_folder)
+        _publish(temporary, out_folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     click.echo(f"{out_folder}: {summary.status}")
     for reason in summary.reasons:
         click.echo(f"  {reason}")
+
+
+def _publish(temporary: Path, out_folder: Path) -> None:
+    """Give the result its name, or another one where the name was taken during the fit.
+
+    Raises:
+        InputError: the name was taken; the message says where the result is.
+    """
+    try:
+        publish_folder(temporary, out_folder)
+    except OSError:
+        if not os.path.lexists(out_folder):
+            raise
+        kept = Path(f"{out_folder}-{temporary.name.removeprefix('.fit-')}")
+        publish_folder(temporary, kept)
+        raise InputError(
+            f"{out_folder} was made by somebody else during the fit; the result is in {kept}"
+        ) from None
 
 
 def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import click
+from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from station.core.errors import FormatError, InputError
+from station.core.files import read_json
 
 _DIGITS = 5
 """Decimals in tables: hundredths of a millimetre, far below any interval."""
@@ -55,22 +57,64 @@ def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> No
 def _of_result(folder: Path, pose: str) -> dict[str, Any]:
     name = "measurements.json" if pose == "as-scanned" else "measurements-standard.json"
     path = folder / name
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists() and not path.is_symlink():
         raise InputError(
             f"{folder} has no {name}; give a result folder, or measure its mesh: "
             f"reconstruct measure {folder / 'mesh.ply'} --pose {pose}"
+        )
+    document = read_json(path, format="booth-measurements", versions=[1])
+    try:
+        _Document.model_validate_json(json.dumps(document), strict=True)
+    except ValidationError as cause:
+        place = map(str, cause.errors()[0]["loc"])
+        wrong = ".".join(part for part in place if not part.startswith("_"))
+        raise FormatError(
+            f"{path}: {wrong} is missing or not as written by this program; fit the scan again"
         ) from None
-    except ValueError as cause:
-        raise FormatError(f"{path} is damaged ({cause}); fit the scan again") from None
-    if (
-        not isinstance(document, dict)
-        or document.get("format") != "booth-measurements"
-        or document.get("version") != 1
-    ):
-        raise FormatError(f"{path} is not booth-measurements version 1; fit the scan again")
     return document
+
+
+class _Difference(BaseModel):
+    name: str
+    value_m: FiniteFloat
+    interval95_m: tuple[FiniteFloat, FiniteFloat]
+
+
+class _Measured(_Difference):
+    basis: str | None = None
+    standard: str | None = None
+
+
+class _Blank(BaseModel):
+    name: str
+    value_m: None
+    standard: str | None = None
+
+
+class _Content(BaseModel):
+    value: FiniteFloat
+    interval95: tuple[FiniteFloat, FiniteFloat]
+
+
+class _Verdict(BaseModel):
+    status: str
+    reasons: list[str] = []
+
+
+class _Document(BaseModel):
+    """The parts of a result that a table shows."""
+
+    scan_id: str | None = None
+    label: str | None = None
+    created: str | None = None
+    booth: str | None = None
+    calibration: str | None = None
+    pose: str | None = None
+    verdict: _Verdict | None = None
+    measurements: list[_Measured | _Blank]
+    differences: list[_Difference] | None = None
+    volume_m3: _Content | None = None
+    surface_m2: _Content | None = None
 
 
 def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
@@ -92,13 +136,13 @@ def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]
     return [
         (name, unit, document[f"{name}_{unit}"])
         for name, unit in (("volume", "m3"), ("surface", "m2"))
-        if f"{name}_{unit}" in document
+        if document.get(f"{name}_{unit}")
     ]
 
 
 def _heading(document: dict[str, Any]) -> list[tuple[str, str]]:
     """Lines before any number: the verdict with its reasons, then the scan."""
-    verdict = document.get("verdict", {})
+    verdict = document.get("verdict") or {}
     lines = [("verdict", verdict["status"])] if verdict else []
     lines += [("reason", reason) for reason in verdict.get("reasons", ())]
     keys = ("scan_id", "label", "created", "booth", "calibration", "pose")
@@ -114,8 +158,10 @@ def _write_csv(document: dict[str, Any]) -> None:
         numbers: tuple[float | str, ...] = ("", "", "")
         if row["value_m"] is not None:
             numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
-        writer.writerow([row["name"], *numbers, "m", row.get("basis") or "", row["standard"]])
-    for row in document.get("differences", ()):
+        writer.writerow(
+            [row["name"], *numbers, "m", row.get("basis") or "", row.get("standard") or ""]
+        )
+    for row in document.get("differences") or ():
         numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
         writer.writerow([f"{row['name']}_left_minus_right", *numbers, "m", "", ""])
     for name, unit, content in _contents(document):
@@ -138,13 +184,13 @@ def _print_table(document: dict[str, Any]) -> None:
     click.echo("Values with 95 % intervals:")
     unseen = False
     for row in document["measurements"]:
-        tail = f"{words.get(row['name'], '')}{_in_brackets(row['standard'])}"
+        tail = f"{words.get(row['name'], '')}{_in_brackets(row.get('standard'))}"
         if row["value_m"] is None:
             click.echo(f"{row['name']:<31}{_BLANK:>14}{'':<26}{tail}")
             continue
         low, high = row["interval95_m"]
         span = f"{100 * low:6.1f} to {100 * high:5.1f}" if high > low else ""
-        basis = row.get("basis", "")
+        basis = row.get("basis") or ""
         basis = "" if basis == "seen" else basis
         unseen = unseen or bool(basis)
         click.echo(f"{row['name']:<31}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}")
@@ -161,7 +207,7 @@ def _print_differences(document: dict[str, Any]) -> None:
     """Differences between the sides whose interval does not contain 0."""
     certain = [
         row
-        for row in document.get("differences", ())
+        for row in document.get("differences") or ()
         if (ends := row["interval95_m"])[0] < ends[1] and (ends[0] > 0.0 or ends[1] < 0.0)
     ]
     if certain:
@@ -175,5 +221,5 @@ def _print_differences(document: dict[str, Any]) -> None:
         )
 
 
-def _in_brackets(standard: str) -> str:
+def _in_brackets(standard: str | None) -> str:
     return f" ({standard})" if standard else ""
