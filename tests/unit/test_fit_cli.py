@@ -16,7 +16,7 @@ def test_a_result_whose_name_was_taken_during_the_fit_is_kept(tmp_path: Path) ->
     (made / "mesh.ply").write_bytes(b"a body")
     other = tmp_path / "result"
     other.mkdir()
-    with pytest.raises(InputError, match="the result is in .*result-x7"):
+    with pytest.raises(InputError, match=r"the result is in .*result-x7"):
         _publish(made, other)
     assert (tmp_path / "result-x7/mesh.ply").read_bytes() == b"a body"
     assert not list(other.iterdir())
