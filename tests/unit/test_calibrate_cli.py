@@ -192,7 +192,7 @@ def test_nobody_is_waited_for_unattended(capsys: pytest.CaptureFixture[str]) -> 
     guide.done("seen")
     assert not guide.answers_yes("Once more?")
     lines = capsys.readouterr().out.split("\n")
-    assert lines == ["", "Ball", "  Wave it.", "  0 s", "  seen", ""]
+    assert lines == ["", "Ball", "  Wave it.", "  0 s", "  99 s", "  seen", ""]
 
 
 def test_an_option_before_the_step_is_not_dropped(config: Path) -> None:

@@ -25,6 +25,7 @@ class Guide:
     """To walk into the booth, lay the ball down and step back; a walk alone takes half of it."""
     _explained: bool = False
     _told_s: float = 0.0
+    _untold: str = ""
     _open_line: bool = False
 
     def step(self, title: str, instruction: str = "", *, lays: bool = False) -> None:
@@ -70,8 +71,10 @@ class Guide:
             click.echo(f"\r  {text:<{_WIDTH}}"[: _WIDTH + 3], nl=False)
             self._open_line = True
         elif now or moment - self._told_s > _LINE_EVERY_S:
-            self._told_s = moment
+            self._told_s, self._untold = moment, ""
             click.echo(f"  {text}")
+        else:
+            self._untold = text
 
     def say(self, text: str) -> None:
         """A line that stays."""
@@ -96,7 +99,10 @@ class Guide:
         return float(answer) or None
 
     def end_line(self) -> None:
-        """End the progress line."""
+        """End the progress; its last line is printed in any case."""
+        if self._untold:
+            click.echo(f"  {self._untold}")
+            self._untold = ""
         if self._open_line:
             click.echo()
             self._open_line = False

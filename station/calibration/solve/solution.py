@@ -70,7 +70,11 @@ class Solution:
     def summary(self) -> list[str]:
         """Lines for the operator."""
         rms_mm = 1e3 * self.rig.residual_rms_m
-        lines = [f"tested on every fifth second: {rms_mm:.1f} mm rms between cameras"]
+        lines = [
+            "the calibration can be used" if self.weak else "the calibration is good",
+            "tested on every fifth second, which it does not use: cameras see the ball "
+            f"{rms_mm:.1f} mm apart (rms)",
+        ]
         for name, one in self.held_out.items():
             shift_m, turn_rad = self._sigma(name)
             known = (
