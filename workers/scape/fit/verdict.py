@@ -248,7 +248,10 @@ def _unseen_parts(parts: Sequence[PartReport]) -> dict[str, str]:
         extremity = part.name.startswith(_EXTREMITIES)
         if part.coverage < (_MIN_EXTREMITY_COVERAGE if extremity else _MIN_COVERAGE):
             words = part_in_words(part.name)
-            reasons[part.name] = f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"
+            reason = f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"
+            if part.name == "head":
+                reason += "; cover dark hair with a light cap"
+            reasons[part.name] = reason
     return reasons
 
 
