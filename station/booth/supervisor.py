@@ -30,8 +30,9 @@ WATCHDOG_S = 10.0
 """As in the systemd units. A main loop's longest step is far below a second."""
 _STARTING_S = 120.0
 """Compiling the reconstruction for the first time takes most of a minute."""
-_BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0)
-"""A camera process that keeps dying is restarted within seconds each time."""
+_BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""A process that keeps dying is restarted within seconds each time. With 2 s at most, nine of them
+whose configuration had been deleted kept both cores busy."""
 _CALM_S = 10.0
 _STOP_S = 5.0
 
