@@ -67,6 +67,7 @@ def observe(booth: SimulatedBooth, images: bool) -> Observations:
 class Verdict:
     """Honesty of one booth's stated errors."""
 
+    case: str
     words: str
     ratios: tuple[float, float, float] | None = None
     """Errors of height, girth (at the middle of the trunk) and tilt over what is stated; None if
@@ -88,7 +89,7 @@ def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) ->
     try:
         solution = solved(booth.rig, seen)
     except CalibrationError as refusal:
-        return Verdict(f"{name:<20}{seed:>4}  refused: {refusal}")
+        return Verdict(name, f"{name:<20}{seed:>4}  refused: {refusal}")
     seconds = time.process_time() - start_s
     shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.world_poses)[:, 3:], axis=1)
     unknowns = 6 * (len(booth.rig.cameras) - 1)
@@ -99,7 +100,7 @@ def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) ->
     girths = np.abs(found.girths_mm)
     tilt_sigma_deg = float(np.degrees(predicted.tilt_sigma_rad))
     bars = {
-        "chi2": 0.5 <= chi2 <= 3.0,
+        "chi2": chi2 <= 3.0,
         "cloud": found.normal_rms_mm <= (0.6 if CASES[name] else 0.15),
         "pairs": bool(CASES[name]) or np.mean(shifts) <= 1.2,
         "tilt": found.tilt_deg <= min(0.15, 3.0 * tilt_sigma_deg),
@@ -135,7 +136,7 @@ def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) ->
         with tempfile.TemporaryDirectory() as folder:
             rows = scan_rows(model, booth, solution.rig, Path(folder))
         words += f"\n{rows.words()}"
-    return Verdict(words, ratios, float(chi2), beyond_twice, seconds, rows)
+    return Verdict(name, words, ratios, float(chi2), beyond_twice, seconds, rows)
 
 
 def summary(verdicts: Sequence[Verdict]) -> None:
@@ -147,14 +148,20 @@ def summary(verdicts: Sequence[Verdict]) -> None:
     beyond = sum(one.beyond_twice for one in accepted)
     hold = 100.0 * np.mean(ratios[:, :2] < 1.96, axis=0)
     chi2 = np.array([one.chi2 for one in accepted])
+    of_case = {
+        name: float(np.mean([one.chi2 for one in accepted if one.case == name]))
+        for name in dict.fromkeys(one.case for one in accepted)
+    }
     # Of the whole process: what the calibration alone takes is less.
     memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f"\n{len(accepted)} of {len(verdicts)} booths accepted")
     _bar("booths beyond twice a bar", beyond, beyond == 0, "0")
     for what, share in zip(("heights", "girths"), hold, strict=True):
         _bar(f"{what} within their stated 95 % (%)", share, share >= 93.0, ">= 93")
-    _bar("chi2 a number, mean", chi2.mean(), 0.5 <= chi2.mean() <= 3.0, "0.5 to 3")
-    _bar("chi2 a number, worst", chi2.max(), chi2.max() <= 3.0, "<= 3")
+    # The errors of one booth are 18 numbers: of an honest covariance they give 0.46 to 1.75.
+    for name, mean in of_case.items():
+        _bar(f"chi2 a number, {name}", mean, 0.5 <= mean <= 3.0, "0.5 to 3")
+    _bar("chi2 a number, worst booth", chi2.max(), chi2.max() <= 3.0, "<= 3")
     scanned = [one.rows for one in accepted if one.rows is not None]
     delivered = [rows for rows in scanned if rows.status == "ok"]
     if delivered:

@@ -188,7 +188,7 @@ def test_other_cameras_are_not_mixed_in(tmp_path: Path) -> None:
 
 
 def test_advice_names_what_is_missing() -> None:
-    coverage = Coverage(CAMERAS, "front-upper")
+    coverage = Coverage(CAMERAS, "front-upper", 0.1)
     assert coverage.share == 0.0
     assert "0 of 120" in coverage.advice()
     rng = np.random.default_rng(0)
@@ -211,8 +211,15 @@ def test_advice_names_what_is_missing() -> None:
     assert coverage.advice() == "everything is covered"
 
 
+def test_balls_that_may_be_covered_cover_nothing() -> None:
+    coverage = Coverage(CAMERAS, "front-upper", 0.1)
+    for moment in range(100):
+        coverage.add(replace(_ball("front-upper", 0.1 * moment), radius_sigma_m=5e-3))
+    assert coverage.counts() == dict.fromkeys(CAMERAS, 0)
+
+
 def test_one_corner_of_the_image_is_not_enough() -> None:
-    coverage = Coverage(CAMERAS, "front-upper")
+    coverage = Coverage(CAMERAS, "front-upper", 0.1)
     for moment in range(400):
         for index, name in enumerate(CAMERAS):
             coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (-0.3, -0.3, 1.5)))

@@ -8,8 +8,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from station.calibration.adjust.problem import Sightings
 from station.calibration.detect.coverage import Coverage
-from station.calibration.solve.acceptance import HeldOut, widen_by_test
+from station.calibration.solve.acceptance import HeldOut, held_out_seconds, widen_by_test
 from station.calibration.solve.refusals import STAND_WORDS, Limits, check_predicted
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -25,6 +26,27 @@ RMS_M, SECONDS = 2e-3, 16
 
 def _held_out(mean_m: float) -> HeldOut:
     return HeldOut(int(SECONDS * INDEPENDENT_HZ), RMS_M, np.array([mean_m, 0.0, 0.0]))
+
+
+def _waved(name: str, times_s: list[float]) -> Sightings:
+    count = len(times_s)
+    flat = np.ones((count, 1))
+    pixels = np.ones((count, 1, 2))
+    return Sightings(name, np.array(times_s), np.ones((count, 3)), pixels, flat, flat, 0.0 * pixels)
+
+
+def test_every_camera_is_tested_however_rarely_it_saw_the_ball_with_others() -> None:
+    often = list(np.arange(0.0, 20.0, 0.05))
+    rarely = [*np.arange(2.0, 3.0, 0.05), *np.arange(7.1, 7.5, 0.05)]
+    waved = {"a": _waved("a", often), "b": _waved("b", often)}
+    assert held_out_seconds(waved).tolist() == [4, 9, 14, 19]
+    waved["c"] = _waved("c", rarely)
+    assert held_out_seconds(waved).tolist() == [4, 7, 9, 14, 19]
+
+
+def test_seconds_in_which_one_camera_alone_saw_the_ball_test_nothing() -> None:
+    early, late = list(np.arange(0.0, 10.0, 0.05)), list(np.arange(5.0, 15.0, 0.05))
+    assert held_out_seconds({"a": _waved("a", early), "b": _waved("b", late)}).tolist() == [9]
 
 
 def test_offsets_within_their_own_noise_widen_nothing() -> None:
@@ -44,7 +66,7 @@ def test_offsets_beyond_their_noise_widen_what_is_said() -> None:
 
 
 def _nothing_seen() -> Coverage:
-    return Coverage(default_rig().cameras, "front-upper")
+    return Coverage(default_rig().cameras, "front-upper", 0.1)
 
 
 @pytest.mark.parametrize(

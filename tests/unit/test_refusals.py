@@ -39,7 +39,7 @@ def seen(*, mark: bool) -> Observations:
 
 
 def coverage(balls: int) -> Coverage:
-    found = Coverage(CAMERAS, NAMES[0])
+    found = Coverage(CAMERAS, NAMES[0], RADIUS_M)
     for _ in range(balls):
         found.add(ball())
     return found
@@ -177,5 +177,6 @@ def test_a_ball_that_is_partly_covered_counts_only_where_its_radius_is_certain()
     ]
     kept = sorted_detections(balls, NAMES[:1], RADIUS_M)[NAMES[0]].waved
     assert [one.time_s for one in kept] == [0.0, 2.0, 4.0]
+    assert [one.time_s for one in balls if one.certain(RADIUS_M)] == [0.0, 2.0, 4.0]
     at_rest = sorted_detections(balls, NAMES[:1], RADIUS_M, held=False)[NAMES[0]].waved
     assert len(at_rest) == 5

@@ -27,19 +27,24 @@ _GO = {"top": "higher", "bottom": "lower", "middle": "in the middle"}
 
 
 class Coverage:
-    """Counts detections as they come."""
+    """Counts detections as they come, those that are certain enough for a solution."""
 
-    def __init__(self, cameras: Mapping[str, CameraCalibration], reference: str) -> None:
-        self._cameras, self._reference = cameras, reference
+    def __init__(
+        self, cameras: Mapping[str, CameraCalibration], reference: str, radius_m: float
+    ) -> None:
+        self._cameras, self._reference, self._radius_m = cameras, reference, radius_m
         self._seen = dict.fromkeys(cameras, 0)
         self._cells = {name: np.zeros((3, 3), np.int64) for name in cameras}
         self._depths: dict[str, tuple[float, float]] = dict.fromkeys(cameras, (0.0, 0.0))
         """Sums of the distances and of their squares."""
         self._last_s: dict[str, float] = {}
-        self._together: dict[frozenset[str], int] = {}
+        self._together: dict[tuple[str, str], int] = {}
+        """Detections of the first camera just after one of the second."""
 
     def add(self, ball: BallDetection) -> None:
         """Take one more detection."""
+        if not ball.certain(self._radius_m):
+            return
         camera = self._cameras[ball.camera]
         z = float(ball.center_m[2])
         u, v = project(camera, ball.center_m)
@@ -51,7 +56,7 @@ class Coverage:
         self._depths[ball.camera] = (total + z, squares + z * z)
         for other, time_s in self._last_s.items():
             if other != ball.camera and abs(time_s - ball.time_s) < _TOGETHER_S:
-                pair = frozenset((other, ball.camera))
+                pair = (ball.camera, other)
                 self._together[pair] = self._together.get(pair, 0) + 1
         self._last_s[ball.camera] = ball.time_s
 
@@ -67,13 +72,15 @@ class Coverage:
         tied: dict[str, tuple[str, int]] = {}
         inside, outside = [self._reference], [n for n in self._cameras if n != self._reference]
         while outside:
-            count, near, far = max(
-                (self._together.get(frozenset((a, b)), 0), a, b) for a in inside for b in outside
-            )
+            count, near, far = max((self._moments(a, b), a, b) for a in inside for b in outside)
             tied[far] = (near, count)
             inside.append(far)
             outside.remove(far)
         return tied
+
+    def _moments(self, a: str, b: str) -> int:
+        """Moments at which two cameras saw the ball, each counted once whoever was first."""
+        return max(self._together.get(pair, 0) for pair in ((a, b), (b, a)))
 
     @property
     def share(self) -> float:

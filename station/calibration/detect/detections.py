@@ -28,6 +28,14 @@ EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND = (
 """Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
 "stand-1700" by the height in millimetres."""
 FLOOR = "floor"
+_RADIUS_CERTAIN = 0.045
+"""Largest standard deviation of a detection's own radius, as a share of the radius, ..."""
+_COVERED_CERTAIN, _COVERED = 0.034, 1.1
+"""... and that of a ball that is partly covered, which is so many times less certain than a whole
+one."""
+_WHOLE_SIGMA_PER_M = 3.8e-5
+"""A whole ball's radius R at the distance z is measured to k z^3 / R^2, as a share of R: from
+`station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
 
 
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:
@@ -63,6 +71,16 @@ class BallDetection:
     radius_sigma_m: float
     patches: Array
     """(k, 4): u, v (pixels), inverse depth (1/m), its variance (1/m2)."""
+
+    def certain(self, radius_m: float) -> bool:
+        """True if its own radius tells it from a ball that a hand covers.
+
+        The edge of a hand looks like the ball's and shifts it by more than noise does, so what is
+        covered in part must be more certain than a whole ball far away.
+        """
+        share = self.radius_sigma_m / radius_m
+        whole = _WHOLE_SIGMA_PER_M * float(self.center_m[2]) ** 3 / radius_m**2
+        return share < min(_RADIUS_CERTAIN, max(_COVERED_CERTAIN, _COVERED * whole))
 
     def to_json(self) -> dict[str, Any]:
         return {

@@ -152,7 +152,7 @@ def _at_rest(seen: list[BallDetection]) -> bool:
 
 def coverage_so_far(session: Session, reference: str) -> Coverage:
     """Coverage of the booth by the waved ball so far."""
-    coverage = Coverage(session.lensed_cameras(), reference)
+    coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
     for ball in session.balls:
         coverage.add(ball)
     return coverage

@@ -1,7 +1,8 @@
 """The test of a calibration on detections that it was not solved from, in millimetres.
 
-Every fifth second is held out. What a camera saw then is compared with where the other cameras saw
-the ball, through the poses and corrections of the rest of the time.
+Every fifth of the seconds in which two cameras see the ball is held out. What a camera saw then is
+compared with where the other cameras saw the ball, through the poses and corrections of the rest of
+the time.
 """
 
 from __future__ import annotations
@@ -51,27 +52,44 @@ class HeldOut:
         return self.rms_m < LARGEST_RMS_M and float(np.linalg.norm(self.mean_m)) < allowed
 
 
-def held_out(times_s: Array, start_s: float) -> NDArray[np.bool_]:
-    """Mask of the times (n,) that fall into a held-out second."""
-    return ((times_s - start_s) / _BLOCK_S).astype(np.int64) % _EVERY == _EVERY - 1
+def held_out_seconds(waved: Mapping[str, Sightings]) -> Array:
+    """Numbers (k,) of the seconds, from the first detection, that are kept for the test.
+
+    Where hands cover the ball most of the time, some cameras see it together with another one in
+    a few seconds only: each camera has at least one of them in the test.
+    """
+    tracks = {name: Track(seen.times_s, seen.centers) for name, seen in waved.items()}
+    length = 1 + max(int(_seconds(waved, seen.times_s).max(initial=0)) for seen in waved.values())
+    together = {}
+    for name, own in tracks.items():
+        known = np.zeros(len(own.times_s), bool)
+        for other, track in tracks.items():
+            known |= (other != name) & track.at(own.times_s)[1]
+        together[name] = np.bincount(_seconds(waved, own.times_s[known]), minlength=length)
+    shared = np.flatnonzero(sum(together.values()))
+    kept = set(shared[_EVERY - 1 :: _EVERY].tolist())
+    for counts in together.values():
+        if sum(counts[list(kept)]) < _MIN_DETECTIONS and counts.max() >= _MIN_DETECTIONS:
+            enough = np.flatnonzero(counts >= _MIN_DETECTIONS)
+            kept.add(int(enough[np.argmin(counts[enough])]))
+    return np.array(sorted(kept), np.int64)
 
 
-def without_held_out(problem: Problem) -> Problem:
+def without_held_out(problem: Problem, seconds: Array) -> Problem:
     """The problem that the solution to be tested is solved from."""
-    start_s = _start(problem)
     waved = {
-        name: seen.take(~held_out(seen.times_s, start_s)) for name, seen in problem.waved.items()
+        name: seen.take(~np.isin(_seconds(problem.waved, seen.times_s), seconds))
+        for name, seen in problem.waved.items()
     }
     return replace(problem, waved=waved)
 
 
-def compare_held_out(problem: Problem, state: State) -> dict[str, HeldOut]:
+def compare_held_out(problem: Problem, seconds: Array, state: State) -> dict[str, HeldOut]:
     """Each camera's held-out detections against the other cameras', by a state solved without."""
-    start_s = _start(problem)
     tracks = {name: corrected(seen, problem, state) for name, seen in problem.waved.items()}
     found = {}
     for name, track in tracks.items():
-        chosen = held_out(problem.waved[name].times_s, start_s)
+        chosen = np.isin(_seconds(problem.waved, problem.waved[name].times_s), seconds)
         away = _differences(track, chosen, [tracks[other] for other in tracks if other != name])
         calm = away[np.linalg.norm(away, axis=1) < 5.0 * _typical(away)] if len(away) else away
         if len(calm) < _MIN_DETECTIONS:
@@ -116,8 +134,10 @@ def _independent(one: HeldOut) -> float:
     return max(1.0, one.detections / (INDEPENDENT_HZ * _BLOCK_S))
 
 
-def _start(problem: Problem) -> float:
-    return min(float(seen.times_s[0]) for seen in problem.waved.values() if len(seen.times_s))
+def _seconds(waved: Mapping[str, Sightings], times_s: Array) -> NDArray[np.int64]:
+    """The second (n,) that each time falls into, counted from the first detection."""
+    start_s = min(float(seen.times_s[0]) for seen in waved.values() if len(seen.times_s))
+    return np.asarray((times_s - start_s) / _BLOCK_S, np.int64)
 
 
 def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -> Array:

@@ -20,15 +20,8 @@ from station.core.rig import CameraCalibration
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_RADIUS_CERTAIN, _RADIUS_ALIKE = 0.045, 0.05
-"""Standard deviation of a detection's own radius, and its distance from the camera's median, as
-shares of the radius."""
-_COVERED_CERTAIN, _COVERED = 0.034, 1.1
-"""Standard deviation of the radius of a ball that is partly covered, as a share of the radius; a
-ball is if it is so many times less certain than a whole one."""
-_WHOLE_SIGMA_PER_M = 3.8e-5
-"""A whole ball's radius R at the distance z is measured to k z^3 / R^2, as a share of R: from
-`station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
+_RADIUS_ALIKE = 0.05
+"""Distance of a detection's own radius from the camera's median, as a share of the radius."""
 _RADIUS_SLACK = 0.10
 """Distance from the stated radius: a depth error of 1 % changes it by 1 %."""
 _MIN_AT_REST = 5
@@ -61,12 +54,11 @@ def sorted_detections(
     *,
     held: bool = True,
 ) -> dict[str, Detections]:
-    """Each camera's detections of the whole ball, in the order of time.
+    """Each camera's detections of the ball, in the order of time.
 
     A hand that covers part of the ball, a head or a fist shows as a radius of its own: only
-    detections are kept whose radius is certain and that of the camera's typical detection. What is
-    covered in part must be more certain than a whole ball far away: the edge of a hand looks like
-    the ball's, and shifts it by more than noise does.
+    detections are kept whose radius is that of the camera's typical detection and, with ``held``,
+    certain.
     """
     found = {}
     for name in cameras:
@@ -74,7 +66,7 @@ def sorted_detections(
             detection
             for detection in detections
             if detection.camera == name
-            and (not held or _certain(detection, radius_m))
+            and (not held or detection.certain(radius_m))
             and abs(detection.radius_m - radius_m) < _RADIUS_SLACK * radius_m
         ]
         typical_m = float(np.median([ball.radius_m for ball in sure])) if sure else radius_m
@@ -92,29 +84,24 @@ def sorted_detections(
     return found
 
 
-def _certain(ball: BallDetection, radius_m: float) -> bool:
-    share = ball.radius_sigma_m / radius_m
-    whole = _WHOLE_SIGMA_PER_M * float(ball.center_m[2]) ** 3 / radius_m**2
-    return share < min(_RADIUS_CERTAIN, max(_COVERED_CERTAIN, _COVERED * whole))
-
-
 def agreeing_detections(
-    detections: Mapping[str, Detections], poses: Mapping[str, Array]
+    detections: Mapping[str, Detections],
+    others: Mapping[str, Detections],
+    poses: Mapping[str, Array],
 ) -> dict[str, Mask]:
-    """Masks of the detections that at least one other camera agrees with."""
+    """Masks of the detections that agree with any of another camera's ``others``."""
     in_reference = {
         name: Track(own.track.times_s, transform(poses[name], own.track.points))
-        for name, own in detections.items()
-        if name in poses
+        for name, own in others.items()
     }
     found = {}
-    for name, track in in_reference.items():
-        agreed = np.zeros(len(track.times_s), bool)
+    for name, own in detections.items():
+        points = transform(poses[name], own.track.points)
+        agreed = np.zeros(len(points), bool)
         for other, theirs in in_reference.items():
             if other != name:
-                places, known = theirs.at(track.times_s)
-                near = np.linalg.norm(places - track.points, axis=1) < GATE_M
-                agreed |= known & near
+                places, known = theirs.at(own.track.times_s)
+                agreed |= known & (np.linalg.norm(places - points, axis=1) < GATE_M)
         found[name] = agreed
     return found
 

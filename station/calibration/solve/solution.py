@@ -145,21 +145,22 @@ def solve(
     # One BLAS thread: other processes use the second core, and more threads wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         progress("checking the detections")
-        coverage = Coverage(cameras, reference)
+        coverage = Coverage(cameras, reference, radius_m)
         for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
             coverage.add(ball)
         refusals.check_counts(coverage)
         measured_m = refusals.check_radius(observations.balls, radius_m)
-        detections = sorted_detections(observations.balls, list(cameras), radius_m)
+        # Balls that are partly covered are good enough for first poses, and to tell what is a ball.
+        seen = sorted_detections(observations.balls, list(cameras), radius_m, held=False)
         refusals.check_rest(observations, front_cameras)
 
         progress("finding the relative positions of the cameras")
-        pairs = estimate_pairs({name: own.track for name, own in detections.items()})
-        refusals.check_pairs(detections, pairs)
+        pairs = estimate_pairs({name: own.track for name, own in seen.items()})
+        refusals.check_pairs(seen, pairs)
         poses = chain_poses(pairs, reference, list(cameras))
         refusals.check_connected(cameras, poses)
 
-        problem = _problem(observations, cameras, detections, poses, radius_m, reference)
+        problem = _problem(observations, cameras, seen, poses, radius_m, reference)
         progress("solving, with every fifth second kept for the test")
         training, tested, found = _tested(problem, poses)
 
@@ -214,13 +215,16 @@ def _tested(
     problem: Problem, poses: Mapping[str, Array]
 ) -> tuple[Problem, State, dict[str, HeldOut]]:
     """The problem without the held-out seconds, its solution, and the test on these seconds."""
-    training = acceptance.without_held_out(replace(problem, model=COARSE, shape_grid=ROUND))
+    seconds = acceptance.held_out_seconds(problem.waved)
+    training = acceptance.without_held_out(
+        replace(problem, model=COARSE, shape_grid=ROUND), seconds
+    )
     coarse = solve_joint(training, first_state(training, poses), informed=False)
     refusals.check_converged(coarse, refusals.DIVERGED)
     training = replace(training, model=problem.model, shape_grid=problem.shape_grid)
     tested = solve_joint(training, _refined(coarse, COARSE, problem), _FINE_ITERATIONS)
     refusals.check_converged(tested, refusals.DIVERGED)
-    found = acceptance.compare_held_out(problem, tested)
+    found = acceptance.compare_held_out(problem, seconds, tested)
     refusals.check_clocks(
         clocks.small_jump(
             {
@@ -237,12 +241,13 @@ def _tested(
 def _problem(
     observations: Observations,
     cameras: Mapping[str, CameraCalibration],
-    detections: Mapping[str, Detections],
+    seen: Mapping[str, Detections],
     poses: Mapping[str, Array],
     radius_m: float,
     reference: str,
 ) -> Problem:
-    agreed = agreeing_detections(detections, poses)
+    detections = sorted_detections(observations.balls, list(cameras), radius_m)
+    agreed = agreeing_detections(detections, seen, poses)
     waved = {
         name: Sightings.of(
             camera,
@@ -252,8 +257,8 @@ def _problem(
     }
     resting: dict[str, list[Sightings]] = {}
     places = {MARK: observations.mark, FRONT: observations.front, **observations.around}
-    for place, seen in places.items():
-        views = [resting_sightings(seen, camera, radius_m) for camera in cameras.values()]
+    for place, balls in places.items():
+        views = [resting_sightings(balls, camera, radius_m) for camera in cameras.values()]
         there = [view for view in views if view is not None]
         if there:
             resting[place] = there
