@@ -67,7 +67,10 @@ def off_m(procedure: VirtualProcedure, name: str, detections: Sequence[BallDetec
 
 
 def agreeing(
-    kept: Mapping[str, Sequence[BallDetection]], off: Mapping[str, Array], within_s: float
+    procedure: VirtualProcedure,
+    kept: Mapping[str, Sequence[BallDetection]],
+    others: Mapping[str, Sequence[BallDetection]],
+    within_s: float,
 ) -> dict[str, NDArray[np.bool_]]:
     """Masks of the detections that another camera agrees with, as a calibration compares them.
 
@@ -76,13 +79,13 @@ def agreeing(
     found = {}
     for name, own in kept.items():
         agreed = np.zeros(len(own), bool)
-        times = np.array([ball.time_s for ball in own])
-        for other, theirs in kept.items():
-            if other == name or not theirs:
-                continue
-            apart_s = np.abs(times[:, None] - np.array([ball.time_s for ball in theirs]))
-            apart_m = np.linalg.norm(off[name][:, None] - off[other], axis=2)
-            agreed |= ((apart_s < within_s) & (apart_m < GATE_M)).any(axis=1)
+        times, off = np.array([ball.time_s for ball in own]), off_m(procedure, name, own)
+        for other, theirs in others.items():
+            if other != name:
+                apart_s = np.abs(times[:, None] - np.array([ball.time_s for ball in theirs]))
+                apart = off[:, None] - off_m(procedure, other, theirs)
+                near = np.linalg.norm(apart, axis=2) < GATE_M
+                agreed |= ((apart_s < within_s) & near).any(axis=1)
         found[name] = agreed
     return found
 
@@ -102,14 +105,18 @@ def judge(seed: int, rate_hz: float) -> tuple[Array, Array, Array, Array]:
     """Errors (n,) of one booth, mm: of what is found, of what is kept, of what is used; and the
     weights of the last."""
     procedure = VirtualProcedure(synthetic.booth(seed, bias_m=0.0, switches=SWITCHES))
-    found, kept, errors, off = {}, {}, {}, {}
+    found, kept, others, errors, kept_mm = {}, {}, {}, {}, {}
     for name in procedure.booth.rig.cameras:
         found[name] = detected(procedure, name, rate_hz)
-        kept[name] = sorted_detections(found[name], [name], procedure.radius_m)[name].waved
-        errors[name] = 1e3 * np.linalg.norm(off_m(procedure, name, found[name]), axis=1)
-        off[name] = off_m(procedure, name, kept[name])
-    agreed = agreeing(kept, off, 0.5 / rate_hz)
-    kept_mm = {name: 1e3 * np.linalg.norm(own, axis=1) for name, own in off.items()}
+        kept[name], others[name] = (
+            sorted_detections(found[name], [name], procedure.radius_m, held=held)[name].waved
+            for held in (True, False)
+        )
+        errors[name], kept_mm[name] = (
+            1e3 * np.linalg.norm(off_m(procedure, name, balls), axis=1)
+            for balls in (found[name], kept[name])
+        )
+    agreed = agreeing(procedure, kept, others, 0.5 / rate_hz)
     used_mm = {name: own[agreed[name]] for name, own in kept_mm.items()}
     for name in found:
         cells = [
