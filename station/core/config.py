@@ -18,7 +18,6 @@ from station.core.errors import ConfigError
 DEFAULT_PATH = Path("booth.toml")
 ENVIRONMENT_VARIABLE = "BOOTH_CONFIG"
 
-
 _SMALLEST_BALL_M = 0.07
 """Seven of eight are found at 2.6 m; of 60 mm balls three, of 50 mm balls none beyond 2.4 m."""
 
@@ -300,8 +299,7 @@ def load_config(path: Path) -> BoothConfig:
         ) from None
     base = {BASE_FOLDER: path.resolve().parent}
     try:
-        cameras = document.get("cameras")
-        if isinstance(cameras, list):
+        if isinstance(cameras := document.get("cameras"), list):
             document["cameras"] = [
                 _camera(section, index, base) for index, section in enumerate(cameras)
             ]
@@ -346,5 +344,7 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
             many = isinstance(part, int)
             section = section.__args__[0] if many else section.model_fields[part].annotation
         return f"unknown key {key}; allowed here: {', '.join(section.model_fields)}"
-    message = problem["msg"].removeprefix("Value error, ")
-    return f"{key}: {message} (found {problem['input']!r:.80})"
+    if problem["type"] == "missing":
+        return f"{key} is missing; booth.example.toml shows what belongs there"
+    said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    return f"{key}: {said.replace('valid tuple', 'list')} (found {problem['input']!r:.80})"
