@@ -44,6 +44,12 @@ AROUND_WORDS = (
 )
 
 
+_MORE_AROUND_WORDS = (
+    "lay the ball at more places on the floor around the mark, where a lower camera sees it "
+    "(station calibrate around)"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Largest errors (95 %) that a calibration by itself may add, metres."""
@@ -174,6 +180,11 @@ def remedy(stood: bool) -> str:
     return "wave the ball longer" if stood else f"{STAND_WORDS}, and wave the ball longer"
 
 
+def slope_words(laid: bool) -> str:
+    """Advice against a doubtful slope; ``laid``: the ball was laid around the mark already."""
+    return _MORE_AROUND_WORDS if laid else AROUND_WORDS
+
+
 def check_predicted(
     predicted: PredictedError, limits: Limits, coverage: Coverage, stood: bool
 ) -> None:
@@ -192,11 +203,11 @@ def check_predicted(
             )
 
 
-def check_slope(world_poses: WorldPoses) -> None:
+def check_slope(world_poses: WorldPoses, laid: bool) -> None:
     if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         raise CalibrationError(
             "the floor's slope is only known to within "
-            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {AROUND_WORDS}"
+            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {slope_words(laid)}"
         )
 
 

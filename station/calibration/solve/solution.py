@@ -21,7 +21,7 @@ from station.calibration.adjust.sensor_model import COARSE, SensorModel
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import FLOOR, FRONT, MARK, STAND, Observations
+from station.calibration.detect.detections import AROUND, FLOOR, FRONT, MARK, STAND, Observations
 from station.calibration.solve import acceptance, clocks, refusals, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
@@ -168,16 +168,15 @@ def solve(
         problem, state = _final(problem, training, tested)
         world_poses = world.poses_in_world(problem, state, front_cameras)
         refusals.check_upright(world_poses)
-        refusals.check_slope(world_poses)
+        refusals.check_slope(world_poses, _laid(problem))
         refusals.check_stands(problem, state)
         refusals.check_mark(world_poses, radius_m)
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
-        stood = bool(problem.heights_m)
-        refusals.check_predicted(predicted, limits, coverage, stood)
+        refusals.check_predicted(predicted, limits, coverage, bool(problem.heights_m))
         rig = replace(rig, predicted=predicted)
-        weak = _advice(predicted, world_poses, limits, coverage, stood)
+        weak = _advice(problem, predicted, world_poses, limits, coverage)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
 
 
@@ -199,16 +198,20 @@ def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem,
 
 
 def _advice(
-    predicted: PredictedError, world_poses: WorldPoses, limits: Limits, coverage: Coverage,
-    stood: bool,
+    problem: Problem, predicted: PredictedError, world_poses: WorldPoses, limits: Limits,
+    coverage: Coverage,
 ) -> tuple[str, ...]:  # fmt: skip
-    """Sentences on what could be better; ``stood``: the ball was on a stand."""
+    """Sentences on what could be better."""
     weak = [] if coverage.enough else [coverage.advice()]
     if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
-        weak.append(f"for heights, {refusals.remedy(stood)}")
+        weak.append(f"for heights, {refusals.remedy(bool(problem.heights_m))}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
-        weak.append(f"for the floor's slope, {refusals.AROUND_WORDS}")
+        weak.append(f"for the floor's slope, {refusals.slope_words(_laid(problem))}")
     return tuple(weak)
+
+
+def _laid(problem: Problem) -> bool:
+    return any(place.startswith(AROUND) for place in problem.resting)
 
 
 def _tested(
