@@ -22,9 +22,9 @@ from station.core.depth_image import Image
 
 Array = NDArray[np.float64]
 
-_THING_BLOCKS = (4, 3)
-"""Height and width of what one thing fills, in the reference's blocks: 320 x 240 px, 0.9 x 0.7 m at
-a distance of 1.7 m."""
+_THINGS_BLOCKS = ((4, 3), (6, 2))
+"""Heights and widths of what one thing fills, in the reference's blocks: 320 x 240 px, 0.9 x 0.7 m
+at a distance of 1.7 m; and 480 x 160 px, a chair with its legs that stands near the camera."""
 _PREFERRED = 3.0
 """Twice the log of how many times likelier a camera within the tolerance has to make the rest."""
 _PLACES = 2
@@ -116,9 +116,8 @@ def _wider(one: Array, other: Array) -> Array:
 def _things(reference: DriftReference) -> Iterator[NDArray[np.intp]]:
     """Numbers of the blocks of each part of the image that one thing can fill; parts overlap."""
     blocks = reference.block[::BLOCK, ::BLOCK]
-    height, width = (
-        min(most, have) for most, have in zip(_THING_BLOCKS, blocks.shape, strict=True)
-    )
-    for row in range(blocks.shape[0] - height + 1):
-        for column in range(blocks.shape[1] - width + 1):
-            yield blocks[row : row + height, column : column + width].ravel()
+    for shape in _THINGS_BLOCKS:
+        height, width = np.minimum(shape, blocks.shape)
+        for row in range(blocks.shape[0] - height + 1):
+            for column in range(blocks.shape[1] - width + 1):
+                yield blocks[row : row + height, column : column + width].ravel()
