@@ -87,7 +87,7 @@ def check_recording(folder: Path) -> list[tuple[float, int, Path]]:
     except OSError as cause:
         raise FormatError(
             f"{index} cannot be read ({cause.strerror}); {folder} is not a recording, "
-            "make one with: station record-virtual"
+            "make one with: station record-virtual --out FOLDER"
         ) from None
     frames = []
     for name in names:

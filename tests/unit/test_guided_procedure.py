@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import click
@@ -17,6 +19,7 @@ from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
+from station.core.errors import CalibrationError
 from station.simulation.scene import default_rig
 
 COUNTDOWN_S = 8.0
@@ -54,6 +57,23 @@ def guided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Procedure, 
     begun = Procedure(cast(BoothConfig, None), store, None, guide)
     assert session.done(EMPTY)
     return begun, session, looked
+
+
+def test_a_step_without_a_cameras_recording_is_found_before_the_first_step(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path
+) -> None:
+    """The ball's was missed 78 s later."""
+    begun, _, looked = guided
+    names = list(default_rig().cameras)
+    for step in ("empty", "ball"):
+        for name in names:
+            (tmp_path / "recordings" / step / name).mkdir(parents=True)
+    (tmp_path / "recordings" / "ball" / names[2]).rmdir()
+    config = SimpleNamespace(cameras=[SimpleNamespace(name=name) for name in names])
+    replayed = replace(begun, config=cast(BoothConfig, config), recordings=tmp_path / "recordings")
+    with pytest.raises(CalibrationError, match=f"ball holds no recording of camera {names[2]}"):
+        replayed.run()
+    assert looked == []
 
 
 def _answers(monkeypatch: pytest.MonkeyPatch, confirmed: list[bool]) -> None:

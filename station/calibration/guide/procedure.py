@@ -73,6 +73,7 @@ class Procedure:
 
     def run(self) -> None:
         """All steps that are not done yet."""
+        self._check_recordings()
         session = self.unfinished_session()
         if session is not None:
             self.guide.say(f"continuing the calibration that was started at {session.started}")
@@ -94,6 +95,20 @@ class Procedure:
         if session is None or session.wall_count < _BOARDS:
             self.walls(asked=True)
         self.solve()
+
+    def _check_recordings(self) -> None:
+        """Recorded steps are of all cameras: one that is missing is not found out minutes later."""
+        if self.recordings is None or not self.recordings.is_dir():
+            return
+        for step in sorted(path for path in self.recordings.iterdir() if path.is_dir()):
+            missing = [
+                camera.name for camera in self.config.cameras if not (step / camera.name).is_dir()
+            ]
+            if missing:
+                raise CalibrationError(
+                    f"{step} holds no recording of camera {', '.join(missing)}: record that step "
+                    "again, or take its folder away"
+                )
 
     def empty(self) -> None:
         """The empty booth and its floor."""

@@ -49,7 +49,7 @@ Progress = Callable[[str], None]
 _MIN_SPREAD_M = 0.15
 """Least rms distance of the resting ball's places from one line, where no camera sees the floor."""
 _FINE_ITERATIONS = 16
-_GOOD_SLOPE_RAD = np.radians(0.06)
+_GOOD_SLOPE_RAD = np.radians(0.1)
 
 
 @dataclass(frozen=True, slots=True)
