@@ -345,6 +345,6 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
             section = section.__args__[0] if many else section.model_fields[part].annotation
         return f"unknown key {key}; allowed here: {', '.join(section.model_fields)}"
     if problem["type"] == "missing":
-        return f"{key} is missing; booth.example.toml shows what belongs there"
+        return f"{key} is missing"
     said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     return f"{key}: {said.replace('valid tuple', 'list')} (found {problem['input']!r:.80})"

@@ -37,11 +37,13 @@ def _waved(name: str, times_s: list[float]) -> Sightings:
 
 def test_every_camera_is_tested_however_rarely_it_saw_the_ball_with_others() -> None:
     often = list(np.arange(0.0, 20.0, 0.05))
-    rarely = [*np.arange(2.0, 3.0, 0.05), *np.arange(7.1, 7.5, 0.05)]
+    rarely = [*np.arange(2.0, 3.0, 0.05), *np.arange(7.1, 7.5, 0.05), *np.arange(11, 12, 0.04)]
     waved = {"a": _waved("a", often), "b": _waved("b", often)}
     assert held_out_seconds(waved).tolist() == [4, 9, 14, 19]
     waved["c"] = _waved("c", rarely)
-    assert held_out_seconds(waved).tolist() == [4, 7, 9, 14, 19]
+    assert held_out_seconds(waved).tolist() == [2, 4, 9, 14, 19]
+    waved["c"] = _waved("c", [second + 0.1 * i for second in range(3) for i in range(5)])
+    assert held_out_seconds(waved).tolist() == [0, 1, 2, 4, 9, 14, 19]
 
 
 def test_seconds_in_which_one_camera_alone_saw_the_ball_test_nothing() -> None:

@@ -38,10 +38,10 @@ def seen(*, mark: bool) -> Observations:
     return Observations([], [ball()] if mark else [], [], [], {})
 
 
-def coverage(balls: int) -> Coverage:
+def coverage(balls: int, covered: int = 0) -> Coverage:
     found = Coverage(CAMERAS, NAMES[0], RADIUS_M)
-    for _ in range(balls):
-        found.add(ball())
+    for sigma_m in [1e-4] * balls + [0.2 * RADIUS_M] * covered:
+        found.add(ball(sigma_m=sigma_m))
     return found
 
 
@@ -91,6 +91,9 @@ LIMITS = refusals.Limits()
 REFUSED: dict[str, Callable[[], object]] = {
     "has not been waved yet: station calibrate ball": partial(refusals.check_counts, coverage(0)),
     "saw the ball in 5 frames only": partial(refusals.check_counts, coverage(5)),
+    "and in 9 more partly covered or too far away: hold it with few fingers": partial(
+        refusals.check_counts, coverage(5, covered=9)
+    ),
     "the ball measures 110 mm in radius, but 100 mm was given": partial(
         refusals.check_radius, [ball(0.11)] * 3, RADIUS_M
     ),

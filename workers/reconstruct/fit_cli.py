@@ -114,7 +114,7 @@ def _publish(temporary: Path, out_folder: Path) -> None:
     try:
         publish_folder(temporary, out_folder)
     except OSError:
-        if not os.path.lexists(out_folder):
+        if not (temporary.exists() and os.path.lexists(out_folder)):
             raise
         kept = Path(f"{out_folder}-{temporary.name.removeprefix('.fit-')}")
         publish_folder(temporary, kept)

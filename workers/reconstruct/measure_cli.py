@@ -67,7 +67,7 @@ def _of_result(folder: Path, pose: str) -> dict[str, Any]:
         _Document.model_validate_json(json.dumps(document), strict=True)
     except ValidationError as cause:
         place = map(str, cause.errors()[0]["loc"])
-        wrong = ".".join(part for part in place if not part.startswith("_"))
+        wrong = ".".join(part for part in place if not part.startswith("_")) or "its text"
         raise FormatError(
             f"{path}: {wrong} is missing or not as written by this program; fit the scan again"
         ) from None

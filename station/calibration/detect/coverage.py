@@ -34,6 +34,7 @@ class Coverage:
     ) -> None:
         self._cameras, self._reference, self._radius_m = cameras, reference, radius_m
         self._seen = dict.fromkeys(cameras, 0)
+        self._covered = dict.fromkeys(cameras, 0)
         self._cells = {name: np.zeros((3, 3), np.int64) for name in cameras}
         self._depths: dict[str, tuple[float, float]] = dict.fromkeys(cameras, (0.0, 0.0))
         """Sums of the distances and of their squares."""
@@ -44,6 +45,7 @@ class Coverage:
     def add(self, ball: BallDetection) -> None:
         """Take one more detection."""
         if not ball.certain(self._radius_m):
+            self._covered[ball.camera] += 1
             return
         camera = self._cameras[ball.camera]
         z = float(ball.center_m[2])
@@ -63,6 +65,10 @@ class Coverage:
     def counts(self) -> dict[str, int]:
         """Detections of each camera."""
         return dict(self._seen)
+
+    def covered(self) -> dict[str, int]:
+        """Detections of each camera that are not certain enough: partly covered, or far away."""
+        return dict(self._covered)
 
     def links(self) -> dict[str, tuple[str, int]]:
         """The camera that ties each to the reference, directly or not, and the number of moments.
@@ -100,7 +106,7 @@ class Coverage:
         """Each need: how much of it there is (1 = enough), and what to do about it."""
         needs = []
         for name, count in self._seen.items():
-            words = f"hold the ball in front of {name} ({count} of {_ENOUGH_SEEN} times seen)"
+            words = f"hold the ball in front of {name} ({count} of {_ENOUGH_SEEN} times seen well)"
             needs.append((count / _ENOUGH_SEEN, words))
             if count:
                 needs += [(self._spread_m(name) / _DEPTH_SPREAD_M, self._nearer_words(name))]

@@ -99,7 +99,7 @@ class Guide:
         return float(answer) or None
 
     def end_line(self) -> None:
-        """End the progress; its last line is printed in any case."""
+        """End the progress; its last line is printed, whenever it came."""
         if self._untold:
             click.echo(f"  {self._untold}")
             self._untold = ""

@@ -213,7 +213,7 @@ def wave_ball(
     if feed.replays and feed.missed:
         guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
-    guide.done(f"the ball was seen: {counts}")
+    guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
     if not coverage.enough:

@@ -28,8 +28,8 @@ LARGEST_RMS_M = 0.006
 """Largest rms of single detections, whose own noise is 1-2 mm."""
 LARGEST_MEAN_M = 0.0025
 """Largest mean of a camera's held-out detections, in which the noise averages out."""
-_MIN_DETECTIONS = 6
-"""Fewer comparisons prove nothing."""
+_MIN_DETECTIONS, _WANTED = 6, 12
+"""Fewer comparisons prove nothing; some may be outliers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def held_out_seconds(waved: Mapping[str, Sightings]) -> Array:
     """Numbers (k,) of the seconds, from the first detection, that are kept for the test.
 
     Where hands cover the ball most of the time, some cameras see it together with another one in
-    a few seconds only: each camera has at least one of them in the test.
+    a few seconds only: as many of these are added as a camera's test takes.
     """
     tracks = {name: Track(seen.times_s, seen.centers) for name, seen in waved.items()}
     length = 1 + max(int(_seconds(waved, seen.times_s).max(initial=0)) for seen in waved.values())
@@ -69,9 +69,13 @@ def held_out_seconds(waved: Mapping[str, Sightings]) -> Array:
     shared = np.flatnonzero(sum(together.values()))
     kept = set(shared[_EVERY - 1 :: _EVERY].tolist())
     for counts in together.values():
-        if sum(counts[list(kept)]) < _MIN_DETECTIONS and counts.max() >= _MIN_DETECTIONS:
-            enough = np.flatnonzero(counts >= _MIN_DETECTIONS)
-            kept.add(int(enough[np.argmin(counts[enough])]))
+        left = counts.copy()
+        left[list(kept)] = 0
+        while (missing := _WANTED - (counts.sum() - left.sum())) > 0 and left.any():
+            enough = np.flatnonzero(left >= missing)
+            second = enough[np.argmin(left[enough])] if len(enough) else np.argmax(left)
+            kept.add(int(second))
+            left[second] = 0
     return np.array(sorted(kept), np.int64)
 
 

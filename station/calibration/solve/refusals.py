@@ -59,9 +59,16 @@ class Limits:
 
 
 def check_counts(coverage: Coverage) -> None:
-    if not any(coverage.counts().values()):
+    covered = coverage.covered()
+    if not any([*coverage.counts().values(), *covered.values()]):
         raise CalibrationError("the ball has not been waved yet: station calibrate ball")
     for name, count in coverage.counts().items():
+        if count < min(_MIN_DETECTIONS, covered[name]):
+            raise CalibrationError(
+                f"camera {name} saw the ball well in {count} frames only ({_MIN_DETECTIONS} are "
+                f"needed), and in {covered[name]} more partly covered or too far away: hold it "
+                f"with few fingers from the side away from {name}, and wave it nearer to {name}"
+            )
         if count < _MIN_DETECTIONS:
             raise CalibrationError(
                 f"camera {name} saw the ball in {count} frames only ({_MIN_DETECTIONS} are "

@@ -72,7 +72,7 @@ class Solution:
         rms_mm = 1e3 * self.rig.residual_rms_m
         lines = [
             "the calibration can be used" if self.weak else "the calibration is good",
-            "tested on every fifth second, which it does not use: cameras see the ball "
+            "tested on a fifth of the seconds, which were left out at first: cameras see the ball "
             f"{rms_mm:.1f} mm apart (rms)",
         ]
         for name, one in self.held_out.items():
@@ -161,7 +161,7 @@ def solve(
         refusals.check_connected(cameras, poses)
 
         problem = _problem(observations, cameras, seen, poses, radius_m, reference)
-        progress("solving, with every fifth second kept for the test")
+        progress("solving, with a fifth of the seconds kept for the test")
         training, tested, found = _tested(problem, poses)
 
         progress("solving with all detections")
