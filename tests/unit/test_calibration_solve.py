@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import synthetic_calibration as synthetic
 from calibrated_booths import FRONT, REFERENCE, pair_errors, reference_errors, solved
+from numpy.typing import NDArray
 from scan_distortion import distortion
 
 from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Observations
@@ -29,6 +30,14 @@ RATE_HZ = 9.0
 @pytest.fixture(scope="module")
 def procedure() -> VirtualProcedure:
     return VirtualProcedure(synthetic.booth(101))
+
+
+class _OnABox(VirtualProcedure):
+    """The ball on the floor to the left of the mark lies on a box."""
+
+    def resting_m(self, step: str) -> NDArray[np.float64]:
+        box_m = np.array([0.0, 0.0, 0.02 if step == "around-0" else 0.0])
+        return super().resting_m(step) + box_m
 
 
 @pytest.fixture(scope="module")
@@ -305,3 +314,13 @@ def test_a_stand_that_was_measured_wrongly_is_refused(
     around["stand-1720"] = around.pop("stand-1700")
     with pytest.raises(CalibrationError, match=r"the ball on the stand of .* too low"):
         solved(procedure.booth.rig, replace(seen, around=around))
+
+
+def test_a_ball_that_lay_on_a_box_is_refused_where_no_camera_sees_the_floor() -> None:
+    """It tilted the world by 1.9 degrees, which was stated as 0.1."""
+    seen = synthetic.observations(
+        _OnABox(synthetic.booth(101)), rate_hz=RATE_HZ, clock_error_s=0.002, boards=True
+    )
+    unseen = replace(seen, planes=[plane for plane in seen.planes if plane.surface != FLOOR])
+    with pytest.raises(CalibrationError, match="do not lie on one floor"):
+        solved(synthetic.booth(101).rig, unseen)

@@ -187,6 +187,15 @@ def test_other_cameras_are_not_mixed_in(tmp_path: Path) -> None:
     assert (tmp_path / SENSORS).exists()
 
 
+def test_a_corrected_height_of_the_stand_replaces_the_wrong_one(tmp_path: Path) -> None:
+    """The wrong one stayed, and the calibration was refused for ever."""
+    session = Session.begin(tmp_path / "s", "2026", 0.1, CAMERAS)
+    for height_mm in (900, 1730, 1700):
+        session.record_resting(f"stand-{height_mm}", [_ball("front-upper", 0.0)])
+    assert list(session.around) == ["stand-900", "stand-1700"]
+    assert list(Session.load(tmp_path / "s").around) == ["stand-900", "stand-1700"]
+
+
 def test_advice_names_what_is_missing() -> None:
     coverage = Coverage(CAMERAS, "front-upper", 0.1)
     assert coverage.share == 0.0

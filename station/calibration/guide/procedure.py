@@ -126,6 +126,9 @@ class Procedure:
         )
         with self._feed(BALL) as (feed, session):
             self._remark_on_ghosts(session)
+            if self.recordings is not None and session.balls:
+                # The recording begins anew: what it shows twice was seen once.
+                session.forget_balls()
             wave_ball(
                 feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
             )

@@ -39,6 +39,8 @@ VERSIONS = frozenset({1})
 SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
+_SAME_STAND_MM = 150
+"""Heights of the stand that are nearer to each other are a measurement and its correction."""
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
@@ -257,6 +259,8 @@ class Session:
         elif step in (MARK, FRONT):
             setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
         elif step.startswith((AROUND, STAND)):
+            for other in [name for name in self.around if _same_stand(name, step)]:
+                del self.around[other]
             self.around[step] = [BallDetection.from_json(ball) for ball in entry["balls"]]
         elif step == "board":
             for name, lens in entry["lenses"].items():
@@ -272,3 +276,11 @@ class Session:
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
         return self._later_s
+
+
+def _same_stand(step: str, other: str) -> bool:
+    """Whether both are one height of the stand, of which the first was measured wrongly."""
+    if not (step.startswith(STAND) and other.startswith(STAND)):
+        return False
+    first_mm, second_mm = (int(name.removeprefix(f"{STAND}-")) for name in (step, other))
+    return abs(first_mm - second_mm) < _SAME_STAND_MM

@@ -34,6 +34,8 @@ can still name the faulty camera."""
 _MARK_TOLERANCE_M = 0.008
 _STAND_TOLERANCE_M = 0.004
 """Four standard deviations of a height that was measured with a tape."""
+_LAID_TOLERANCE_M = 0.002
+"""Five times what is seen of a ball that lies on the floor itself, where that is bowed, too."""
 _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
 SIGMAS_95 = 1.96
@@ -228,6 +230,18 @@ def check_stands(problem: Problem, state: State) -> None:
                 "the floor again, and repeat that step; if it was right, let the sensors warm up "
                 "and wave the ball again"
             )
+
+
+def check_laid(problem: Problem, state: State) -> None:
+    """Refuse a ball that lay on a box: without a stand and a visible floor it tilts the world."""
+    laid = [place for place in problem.resting if place not in problem.heights_m]
+    off_m = max(abs(contact_error_m(problem, state, place)) for place in laid)
+    if off_m > _LAID_TOLERANCE_M:
+        raise CalibrationError(
+            "the places of the ball on the floor do not lie on one floor (one is "
+            f"{1e3 * off_m:.0f} mm off): take away what the ball lay on; start again with "
+            "station calibrate --new"
+        )
 
 
 def check_upright(world_poses: WorldPoses) -> None:

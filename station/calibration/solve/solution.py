@@ -171,6 +171,7 @@ def solve(
         refusals.check_slope(world_poses, _laid(problem))
         refusals.check_stands(problem, state)
         refusals.check_mark(world_poses, radius_m)
+        refusals.check_laid(problem, state)
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
