@@ -69,6 +69,7 @@ def test_a_step_without_a_cameras_recording_is_found_before_the_first_step(
         for name in names:
             (tmp_path / "recordings" / step / name).mkdir(parents=True)
     (tmp_path / "recordings" / "ball" / names[2]).rmdir()
+    (tmp_path / "recordings" / "another" / "thing").mkdir(parents=True)
     config = SimpleNamespace(cameras=[SimpleNamespace(name=name) for name in names])
     replayed = replace(begun, config=cast(BoothConfig, config), recordings=tmp_path / "recordings")
     with pytest.raises(CalibrationError, match=f"ball holds no recording of camera {names[2]}"):

@@ -38,6 +38,13 @@ _WHOLE_SIGMA_PER_M = 3.8e-5
 `station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
 
 
+def stand_height_m(step: str) -> float | None:
+    """Stated height of the stand in a step's name, metres; None: the step has no stand."""
+    if not step.startswith(STAND):
+        return None
+    return 1e-3 * float(step.removeprefix(f"{STAND}-"))
+
+
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:
     """A camera as it comes from the factory: its lens is known, its place is not."""
     return CameraCalibration(

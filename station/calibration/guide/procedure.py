@@ -24,6 +24,7 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
 
+_STEPS = (EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND)
 _SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
 _BOARDS = 3
@@ -101,6 +102,8 @@ class Procedure:
         if self.recordings is None or not self.recordings.is_dir():
             return
         for step in sorted(path for path in self.recordings.iterdir() if path.is_dir()):
+            if not step.name.startswith(_STEPS):
+                continue
             missing = [
                 camera.name for camera in self.config.cameras if not (step / camera.name).is_dir()
             ]

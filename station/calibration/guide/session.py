@@ -28,6 +28,7 @@ from station.calibration.detect.detections import (
     BallDetection,
     Observations,
     PlaneObservation,
+    stand_height_m,
 )
 from station.calibration.detect.scene import StaticView
 from station.core.errors import CalibrationError, FormatError
@@ -39,7 +40,7 @@ VERSIONS = frozenset({1})
 SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
-_SAME_STAND_MM = 150
+_SAME_STAND_M = 0.15
 """Heights of the stand that are nearer to each other are a measurement and its correction."""
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
@@ -280,7 +281,7 @@ class Session:
 
 def _same_stand(step: str, other: str) -> bool:
     """Whether both are one height of the stand, of which the first was measured wrongly."""
-    if not (step.startswith(STAND) and other.startswith(STAND)):
+    first_m, second_m = stand_height_m(step), stand_height_m(other)
+    if first_m is None or second_m is None:
         return False
-    first_mm, second_mm = (int(name.removeprefix(f"{STAND}-")) for name in (step, other))
-    return abs(first_mm - second_mm) < _SAME_STAND_MM
+    return abs(first_m - second_m) < _SAME_STAND_M

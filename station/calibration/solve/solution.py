@@ -21,7 +21,14 @@ from station.calibration.adjust.sensor_model import COARSE, SensorModel
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import AROUND, FLOOR, FRONT, MARK, STAND, Observations
+from station.calibration.detect.detections import (
+    AROUND,
+    FLOOR,
+    FRONT,
+    MARK,
+    Observations,
+    stand_height_m,
+)
 from station.calibration.solve import acceptance, clocks, refusals, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
@@ -272,9 +279,7 @@ def _problem(
             "two seconds that this step takes"
         )
     heights_m = {
-        place: 1e-3 * float(place.removeprefix(f"{STAND}-"))
-        for place in resting
-        if place.startswith(STAND)
+        place: height_m for place in resting if (height_m := stand_height_m(place)) is not None
     }
     surfaces = named_surfaces(observations.planes, cameras, poses)
     if not any(surface.surface == FLOOR for surface in surfaces):
