@@ -302,6 +302,35 @@ def _bumped(seen: Observations, camera: str) -> Observations:
     return _balls(seen, turned)
 
 
+def _moved(balls: Iterable[BallDetection], camera: str, shift_m: float) -> list[BallDetection]:
+    """The balls as a camera sees them that was shifted to its right."""
+    K = default_rig().cameras[camera].K
+    moved = []
+    for ball in balls:
+        if ball.camera == camera:
+            patches = ball.patches.copy()
+            patches[:, 0] -= K[0, 0] * shift_m * patches[:, 2]
+            center_m = ball.center_m - (shift_m, 0.0, 0.0)
+            ball = replace(ball, center_m=center_m, patches=patches)
+        moved.append(ball)
+    return moved
+
+
+def _nudged(seen: Observations, camera: str) -> Observations:
+    """The camera is shifted by 4 mm midway."""
+    middle_s = _middle(seen)
+    early = [ball for ball in seen.balls if ball.time_s < middle_s]
+    late = [ball for ball in seen.balls if ball.time_s >= middle_s]
+    return replace(seen, balls=[*early, *_moved(late, camera, 0.004)])
+
+
+def _moved_later(seen: Observations, camera: str) -> Observations:
+    """The camera is shifted by 6 mm after the waving."""
+    rest = {place: _moved(balls, camera, 0.006) for place, balls in seen.around.items()}
+    mark, front = (_moved(balls, camera, 0.006) for balls in (seen.mark, seen.front))
+    return replace(seen, mark=mark, front=front, around=rest)
+
+
 def _head_on_mark(seen: Observations) -> Observations:
     """One camera took a head for the resting ball, and no camera saw the floor."""
     highest = min(
@@ -337,7 +366,7 @@ FAULTS = (
         "camera back-lower saw the ball in 0 frames",
     ),
     Fault("a sensor that scatters", lambda seen: _scattering(seen, "front-lower"), "front-lower"),
-    Fault("another ball", lambda seen: seen, "the ball measures 100 mm in radius", 0.11),
+    Fault("another ball", lambda seen: seen, "the ball measures 100.0 mm in radius", 0.11),
     Fault("too short", lambda seen: _near(seen, 14.0), "camera "),
     Fault("nothing on the mark", lambda seen: replace(seen, mark=()), "on the mark"),
     Fault("a head above the mark", _head_on_mark, "below the floor"),
@@ -358,4 +387,14 @@ FAULTS = (
         "the clock of camera front-lower jumped",
     ),
     Fault("a camera bumped midway", lambda seen: _bumped(seen, "back-lower"), "back-lower"),
+    Fault(
+        "a camera nudged midway",
+        lambda seen: _nudged(seen, "back-lower"),
+        "camera back-lower, or one that saw the ball with it, was moved while",
+    ),
+    Fault(
+        "a camera moved after the waving",
+        lambda seen: _moved_later(seen, "back-lower"),
+        "it, or one beside it, was moved in between",
+    ),
 )

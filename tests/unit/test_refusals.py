@@ -94,7 +94,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "and in 9 more partly covered or too far away: hold it with few fingers": partial(
         refusals.check_counts, coverage(5, covered=9)
     ),
-    "the ball measures 110 mm in radius, but 100 mm was given": partial(
+    "the ball measures 110.0 mm in radius, but 100.0 mm was given": partial(
         refusals.check_radius, [ball(0.11)] * 3, RADIUS_M
     ),
     "the ball was not seen on the mark": partial(refusals.check_rest, seen(mark=False), NAMES),

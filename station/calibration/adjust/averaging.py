@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
+from station.calibration.adjust.contacts import Belief, Contacts, beliefs
 from station.calibration.adjust.priors import priors, shape_precision
 from station.calibration.adjust.problem import (
+    Doubt,
     Indices,
     Layout,
     Problem,
@@ -56,32 +58,52 @@ _UNLIKELY = 7.0
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    best = max(_smooth_choices(problem, state), key=lambda one: one.best[1])
+    best = max(_smooth_choices(_Base.of(problem, state)), key=lambda one: one.best[1])
     return best.widths(best.best[0])
 
 
 def averaged_state(problem: Problem, state: State) -> State:
-    """The state moved to the mean over all widths, with the covariance over them."""
+    """The state moved to the mean over all widths and beliefs, with the covariance over them."""
     layout = Layout.of(problem)
-    found = _smooth_choices(problem, state)
-    top = max(one.best[1] for one in found)
-    likely = [one for one in found if one.best[1] > top - _UNLIKELY]
-    logs = np.array([one.log_evidence() for one in likely])
+    contacts = Contacts.of(problem, layout, state)
+    sure, *doubtful = beliefs(problem)
+    found = [(sure, one) for one in _smooth_choices(_Base.of(problem, state, contacts, sure))]
+    smooth = [one for _, one in _likely(found)]
+    for belief in doubtful:
+        base = _Base.of(problem, state, contacts, belief)
+        found += [(belief, _SmoothChoice(base, one.levels, one.best[0])) for one in smooth]
+    likely = _likely(found)
+    logs = np.array([one.log_evidence() for _, one in likely])
     weights = np.exp(logs - logsumexp(logs))
-    moments = [one.moments() for one in likely]
+    moments = [one.moments() for _, one in likely]
     mean = sum((w * step for w, (step, _) in zip(weights, moments, strict=True)), np.zeros(1))
     covariance = np.zeros((layout.size, layout.size))
-    for weight, (step, spread) in zip(weights, moments, strict=True):
+    doubts = {belief: Doubt(belief.wrong, 0.0, 0.0) for belief in doubtful}
+    for (belief, _), weight, (step, spread) in zip(likely, weights, moments, strict=True):
         covariance += weight * (spread + np.outer(step - mean, step - mean))
-    return replace(moved_state(problem, layout, state, mean), covariance=covariance)
+        if belief.wrong:
+            there = [contacts.places.index(place) for place in belief.wrong]
+            off_m = float(np.mean(contacts.off_m[there] + contacts.rows[there] @ step))
+            so_far = doubts[belief].probability
+            larger = off_m if weight > so_far else doubts[belief].off_m
+            doubts[belief] = Doubt(belief.wrong, so_far + float(weight), larger)
+    return replace(
+        moved_state(problem, layout, state, mean),
+        covariance=covariance,
+        doubts=sorted(doubts.values(), key=lambda doubt: -doubt.probability),
+    )
 
 
-def _smooth_choices(problem: Problem, state: State) -> list[_SmoothChoice]:
+def _likely(found: Sequence[tuple[Belief, _SmoothChoice]]) -> list[tuple[Belief, _SmoothChoice]]:
+    top = max(one.best[1] for _, one in found)
+    return [one for one in found if one[1].best[1] > top - _UNLIKELY]
+
+
+def _smooth_choices(base: _Base) -> list[_SmoothChoice]:
     """The evidence for levels of depth fields and ball shape, climbed from the middle.
 
     Each search goes on from the best choice of the level before.
     """
-    base = _Base.of(problem, state)
     levels = (len(FIELD_LEVELS), len(SHAPE_LEVELS) if len(base.shape) else 1)
     here = (levels[0] // 2, levels[1] // 2)
     found = {here: _SmoothChoice(base, here, None)}
@@ -112,9 +134,15 @@ class _Base:
     shape: Indices
     shape_precision: Array
     radius_m: float
+    log_belief: float
+    """Log-probability of a belief and of what it says of the contacts at the state."""
 
     @classmethod
-    def of(cls, problem: Problem, state: State) -> _Base:
+    def of(
+        cls, problem: Problem, state: State, contacts: Contacts | None = None,
+        belief: Belief | None = None,
+    ) -> _Base:  # fmt: skip
+        """Under a belief on the contacts; without one, they are weighed as in the solution."""
         layout, model = Layout.of(problem), problem.model
         information, gradient = state.information.copy(), state.gradient.copy()
         values = np.zeros(layout.size)
@@ -140,10 +168,19 @@ class _Base:
             block = prior.information * uncertain[:, None] * uncertain
             information[np.ix_(prior.index, prior.index)] -= block
             gradient[prior.index] -= block @ prior.values
+        log_belief = 0.0
+        if contacts is not None and belief is not None:
+            expected = contacts.covariance(belief)
+            weight, rows = np.linalg.inv(expected), contacts.rows
+            information += rows.T @ (weight - np.diag(contacts.weight)) @ rows
+            gradient += rows.T @ (weight @ contacts.off_m - contacts.weight * contacts.off_m)
+            log_belief = float(np.log(belief.probability))
+            log_belief -= 0.5 * float(np.linalg.slogdet(expected)[1])
+            log_belief -= 0.5 * float(contacts.off_m @ weight @ contacts.off_m)
         return cls(
             tuple(problem.cameras), information, gradient, values, groups, fields,
             model.field_precision, layout.shapes, shape_precision(problem, layout),
-            problem.radius_m,
+            problem.radius_m, log_belief,
         )  # fmt: skip
 
 
@@ -151,13 +188,13 @@ class _SmoothChoice:
     """All choices of the other widths where depth fields and ball shape have given ones."""
 
     def __init__(self, base: _Base, levels: tuple[int, int], start: Choice | None) -> None:
-        self._base = base
+        self._base, self.levels = base, levels
         self._field_per_m, self._shape = float(FIELD_LEVELS[levels[0]]), SHAPE_LEVELS[levels[1]]
         information, gradient = base.information.copy(), base.gradient.copy()
         parts = [(index, base.field_precision, self._field_per_m) for index in base.fields]
         if len(base.shape):
             parts.append((base.shape, base.shape_precision, self._shape))
-        cost, log_widths = 0.0, 0.0
+        cost, log_widths = -base.log_belief, 0.0
         for index, unit, width in parts:
             precision = unit / width**2
             pull = precision @ base.values[index]

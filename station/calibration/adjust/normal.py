@@ -14,7 +14,8 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import bsr_matrix, csr_matrix
 
-from station.calibration.adjust.ball_shape import SHAPE, shape_terms, shape_turn
+from station.calibration.adjust.ball_shape import SHAPE, shape_turn
+from station.calibration.adjust.contacts import Contacts
 from station.calibration.adjust.equations import (
     BallEquations,
     ball_equations,
@@ -33,21 +34,10 @@ from station.calibration.adjust.problem import (
 )
 from station.calibration.adjust.residuals import DetectionResiduals
 from station.calibration.adjust.trajectory import path_points
-from station.calibration.detect.detections import FLOOR
 from station.core.geometry import skew
 from station.core.kinect_v1 import FROZEN_SHARE
 
 Array = NDArray[np.float64]
-
-CONTACT_M = 0.0005
-"""Standard deviation of a ball's height on an even floor."""
-TAPE_M = 0.001
-"""Standard deviation of a height that was measured with a tape."""
-_TAIL = 4.0
-"""Degrees of freedom (Student's t) of a contact: the ball may lie on something else."""
-_STAND_TAIL = 20.0
-"""Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
-unexpected form must not push it aside."""
 
 
 class NormalEquations:
@@ -71,8 +61,7 @@ class NormalEquations:
                 self._add_resting(place, seen)
         for surface in problem.surfaces:
             self._add_surface(surface)
-        for place in problem.resting:
-            self._add_contact(place)
+        self._add_contacts()
 
     def solve(self) -> tuple[Array, Array, float]:
         """Steps of the border (m,) and the path (count, 3); the border's in standard deviations."""
@@ -258,51 +247,12 @@ class NormalEquations:
             chain.T @ view.mixed, index, layout.sensor(name), view.theta_matrix, view.theta_gradient
         )
 
-    def _add_contact(self, place: str) -> None:
+    def _add_contacts(self) -> None:
         """The ball rests on the floor, or on a stand of measured height above it."""
-        problem, layout, state = self._problem, self._layout, self._state
-        at, q = state.places[place], state.planes[FLOOR]
-        length = np.linalg.norm(q)
-        above = (1.0 - q @ at) / length
-        terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))
-        off_m = contact_error_m(problem, state, place)
-        row = np.concatenate(
-            [
-                -q / length,
-                -at / length - above * q / length**2,
-                [-1.0],
-                -terms,
-                -state.radius_m * shape_terms(q / length),
-            ]
-        )
-        index = np.concatenate(
-            [
-                layout.triple(place),
-                layout.triple(FLOOR),
-                layout.radius,
-                layout.bow,
-                layout.place_shape(place),
-            ]
-        )
-        row, index = row[index >= 0], index[index >= 0]
-        sigma_m = np.hypot(CONTACT_M, TAPE_M) if place in problem.heights_m else CONTACT_M
-        # A ball that lies on something else is refused later: it must not tilt the floor.
-        tail = _STAND_TAIL if place in problem.heights_m else _TAIL
-        weight = sigma_m**-2.0 * tail / (tail + (off_m / sigma_m) ** 2)
-        self._border[np.ix_(index, index)] += weight * np.outer(row, row)
-        self._gradient[index] += weight * off_m * row
-
-
-def contact_error_m(problem: Problem, state: State, place: str) -> float:
-    """Height (m) of a resting ball above where it touches the floor or its stand."""
-    q = state.planes[FLOOR]
-    length = np.linalg.norm(q)
-    terms = problem.bow_terms.get(place, np.zeros(BOW_SIZE))
-    # The underside of a ball that is not round stands off the sphere as its top does.
-    shape = state.place_shapes.get(place, np.zeros(SHAPE))
-    radius_m = state.radius_m * (1.0 + shape_terms(q / length) @ shape)
-    above = (1.0 - q @ state.places[place]) / length
-    return float(above - terms @ state.bow - radius_m - problem.heights_m.get(place, 0.0))
+        contacts = Contacts.of(self._problem, self._layout, self._state)
+        weighed = contacts.rows * contacts.weight[:, None]
+        self._border += contacts.rows.T @ weighed
+        self._gradient += weighed.T @ contacts.off_m
 
 
 def _spline_rows(first: Indices, value: Array, turn: Array, count: int) -> csr_matrix:

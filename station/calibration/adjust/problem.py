@@ -134,6 +134,16 @@ class Problem:
     sphere."""
 
 
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Probability that people were wrong about the height of some places of the ball."""
+
+    places: tuple[str, ...]
+    probability: float
+    off_m: float
+    """Height of the ball there above what people said, if so."""
+
+
 @dataclass(frozen=True)
 class State:
     """A solution, or a step towards it, in the reference camera's frame."""
@@ -164,6 +174,8 @@ class State:
     """Gradient of half the squared deviations by the border's unknowns."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance of the border's unknowns."""
+    doubts: Sequence[Doubt] = ()
+    """Possible errors of what people said, the likeliest first; nothing where not asked for."""
     deviations: Mapping[str, Array] = field(default_factory=dict)
     """Squared deviation (n,) of each waved detection's centre in units of its noise."""
     scale: float = 1.0

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.ball_shape import SHAPE, shape_turn
 from station.calibration.adjust.equations import corrected_centers
 from station.calibration.adjust.problem import Problem, Sightings, State, seen_shape
-from station.calibration.solve.pairwise import Track
+from station.calibration.solve.pairwise import Track, differences
 from station.core.geometry import transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import PredictedError
@@ -94,7 +95,8 @@ def compare_held_out(problem: Problem, seconds: Array, state: State) -> dict[str
     found = {}
     for name, track in tracks.items():
         chosen = np.isin(_seconds(problem.waved, problem.waved[name].times_s), seconds)
-        away = _differences(track, chosen, [tracks[other] for other in tracks if other != name])
+        tested = Track(track.times_s[chosen], track.points[chosen])
+        _, away = differences(tested, [tracks[other] for other in tracks if other != name])
         calm = away[np.linalg.norm(away, axis=1) < 5.0 * _typical(away)] if len(away) else away
         if len(calm) < _MIN_DETECTIONS:
             found[name] = HeldOut(len(calm), 0.0, np.zeros(3))
@@ -144,19 +146,6 @@ def _seconds(waved: Mapping[str, Sightings], times_s: Array) -> NDArray[np.int64
     return np.asarray((times_s - start_s) / _BLOCK_S, np.int64)
 
 
-def _differences(track: Track, chosen: NDArray[np.bool_], others: list[Track]) -> Array:
-    """(n, 3): detections less the mean of where the others saw the ball at their times."""
-    times, points = track.times_s[chosen], track.points[chosen]
-    total, count = np.zeros_like(points), np.zeros(len(points))
-    for other in others:
-        places, known = other.at(times)
-        near = known & (np.linalg.norm(places - points, axis=1) < 0.1)
-        total[near] += places[near]
-        count[near] += 1.0
-    seen = count > 0
-    return points[seen] - total[seen] / count[seen, None]
-
-
 def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
     """Detections in the reference frame after depth correction and clock offset."""
     name = seen.camera
@@ -165,6 +154,27 @@ def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
         seen_shape(problem, state, name, seen.times_s),
     )  # fmt: skip
     return Track(seen.times_s + state.clock_s[name], transform(state.poses[name], centers))
+
+
+def resting_offsets(problem: Problem, state: State) -> dict[str, Array]:
+    """Mean offset (3,), reference frame, of where each camera sees the resting ball from where the
+    others see it; of cameras that share two places or more."""
+    found: dict[str, list[Array]] = {}
+    for place, sightings in problem.resting.items():
+        shape = state.place_shapes.get(place, np.zeros(SHAPE))
+        at = {}
+        for seen in sightings:
+            name, pose = seen.camera, state.poses[seen.camera]
+            shapes = np.repeat((shape_turn(pose[:3, :3].T) @ shape)[None], len(seen.times_s), 0)
+            centers = corrected_centers(
+                seen, problem.cameras[name], problem.model, state.sensors[name], state.radius_m,
+                shapes,
+            )  # fmt: skip
+            at[name] = transform(pose, centers).mean(axis=0)
+        for name in at if len(at) > 1 else ():
+            others = [center for other, center in at.items() if other != name]
+            found.setdefault(name, []).append(at[name] - np.mean(others, axis=0))
+    return {name: np.mean(offs, axis=0) for name, offs in found.items() if len(offs) > 1}
 
 
 def _typical(away: Array) -> float:

@@ -13,7 +13,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.solve.pairwise import GATE_M, Pair, Track, estimate_pair, match
+from station.calibration.solve.pairwise import (
+    GATE_M,
+    Pair,
+    Track,
+    differences,
+    estimate_pair,
+    match,
+)
 from station.core.geometry import transform
 
 Array = NDArray[np.float64]
@@ -40,6 +47,12 @@ _NOISE_M = 0.003
 _SMALLEST_JUMP_S = 0.010
 _JUMP_SIGMAS = 6.0
 _MOVED_DROP = 0.4
+_SMALL_MOVE_M, _MOVE_SIGMAS = 0.001, 3.0
+"""Least step of a camera's mean difference from the others that is a move, and in standard
+deviations; in sound booths of any kind it is up to 1.7 of these."""
+_MOVE_CUT_S, _MIN_MOVE_S, _MOVE_BLOCK_S, _MOVE_OUTLIER = 2.5, 5, 1.0, 4.0
+"""Moments that are tried, seconds that are needed on both sides, time in which errors are shared,
+and differences so many times the typical one that do not count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +126,37 @@ def moved_camera(tracks: Mapping[str, Track], pairs: Mapping[tuple[str, str], Pa
             if drop > largest and _stands_elsewhere(tracks, drops, cut_s):
                 worst, largest = name, drop
     return worst
+
+
+def slightly_moved_camera(tracks: Mapping[str, Track]) -> str | None:
+    """A camera that was bumped by some millimetres; tracks in one frame, corrected.
+
+    Detections of a second share the errors of one region of the booth.
+    """
+    worst, largest = None, _MOVE_SIGMAS
+    for name, track in tracks.items():
+        times, away = differences(track, [tracks[other] for other in tracks if other != name])
+        if not len(times):
+            continue
+        off = np.linalg.norm(away - np.median(away, axis=0), axis=1)
+        calm = off < _MOVE_OUTLIER * np.median(off)
+        seconds, away = np.floor(times[calm] / _MOVE_BLOCK_S), away[calm]
+        for cut_s in np.arange(times[0], times[-1], _MOVE_CUT_S):
+            early = seconds < cut_s / _MOVE_BLOCK_S
+            if min(len(np.unique(seconds[side])) for side in (early, ~early)) < _MIN_MOVE_S:
+                continue
+            step_m = float(np.linalg.norm(away[early].mean(axis=0) - away[~early].mean(axis=0)))
+            sigmas = [_mean_sigma(away[side], seconds[side]) for side in (early, ~early)]
+            sigma_m = float(np.hypot(sigmas[0], sigmas[1]))
+            if step_m > max(_SMALL_MOVE_M, largest * sigma_m):
+                worst, largest = name, step_m / sigma_m
+    return worst
+
+
+def _mean_sigma(away: Array, seconds: Array) -> float:
+    """Standard deviation of the mean (3,) of differences, of which those of a second err alike."""
+    means = np.array([away[seconds == second].mean(axis=0) for second in np.unique(seconds)])
+    return float(np.sqrt(means.var(axis=0).sum() / len(means)))
 
 
 def _stands_elsewhere(

@@ -6,7 +6,7 @@ along the tree of most agreement. Good to a few centimetres: the depth errors ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -24,6 +24,8 @@ _TRIALS = 400
 GATE_M = 0.045
 """Two cameras' depth errors together, before they are corrected."""
 MIN_MATCHES = 30
+_SAME_BALL_M = 0.1
+"""Two corrected detections that are farther apart are not both of the ball."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,19 @@ class Track:
             self.points[after] - self.points[after - 1]
         )
         return places, known
+
+
+def differences(track: Track, others: Iterable[Track]) -> tuple[Array, Array]:
+    """Times (n,) at which others saw the ball as well, and detections (n, 3) less the mean of where
+    they saw it; corrected tracks in one frame."""
+    total, count = np.zeros_like(track.points), np.zeros(len(track.points))
+    for other in others:
+        places, known = other.at(track.times_s)
+        near = known & (np.linalg.norm(places - track.points, axis=1) < _SAME_BALL_M)
+        total[near] += places[near]
+        count[near] += 1.0
+    seen = count > 0
+    return track.times_s[seen], track.points[seen] - total[seen] / count[seen, None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from station.calibration.detect.detections import (
     Observations,
     stand_height_m,
 )
-from station.calibration.solve import acceptance, clocks, refusals, world
+from station.calibration.solve import acceptance, refusals, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
     Detections,
@@ -175,10 +175,11 @@ def solve(
         problem, state = _final(problem, training, tested)
         world_poses = world.poses_in_world(problem, state, front_cameras)
         refusals.check_upright(world_poses)
+        refusals.check_solved_radius(problem, state)
+        refusals.check_unmoved(problem, state)
+        refusals.check_doubts(problem, state)
         refusals.check_slope(world_poses, _laid(problem))
-        refusals.check_stands(problem, state)
         refusals.check_mark(world_poses, radius_m)
-        refusals.check_laid(problem, state)
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
@@ -236,13 +237,11 @@ def _tested(
     tested = solve_joint(training, _refined(coarse, COARSE, problem), _FINE_ITERATIONS)
     refusals.check_converged(tested, refusals.DIVERGED)
     found = acceptance.compare_held_out(problem, seconds, tested)
-    refusals.check_clocks(
-        clocks.small_jump(
-            {
-                name: acceptance.corrected(seen, training, tested)
-                for name, seen in training.waved.items()
-            }
-        )
+    refusals.check_corrected(
+        {
+            name: acceptance.corrected(seen, training, tested)
+            for name, seen in training.waved.items()
+        }
     )
     refusals.check_scatter(tested)
     refusals.check_held_out(found)
