@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from station.calibration.detect.detections import BALL, EMPTY
+from station.calibration.detect.detections import BALL, EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, Session
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import VirtualProcedure
@@ -90,6 +90,27 @@ def test_killed_while_the_ball_is_waved(config: Path, recordings: Path) -> None:
     assert refused.stderr.count("\n") == 1
     assert len(Session.load(folder).balls) == len(session.balls)
     assert not (config.parent / "calibration.json").exists()
+
+
+def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None:
+    """Ctrl-C ends the command, not only the step; it went on to the next one."""
+    folder = config.parent / "calibrations/unfinished"
+    waving = subprocess.Popen(
+        _command(config, recordings), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    deadline_s = time.monotonic() + 120.0
+    journal = folder / JOURNAL
+    while not journal.exists() or '"step":"ball"' not in journal.read_text():
+        assert time.monotonic() < deadline_s
+        assert waving.poll() is None
+        time.sleep(0.05)
+    waving.send_signal(signal.SIGINT)
+    told = waving.communicate(timeout=30)[0]
+    assert waving.returncode == 130, told
+    assert "stopped; what was seen is kept: station calibrate goes on from here" in told
+    session = Session.load(folder)
+    assert session.balls
+    assert not session.done(MARK)
 
 
 def test_a_missing_camera_is_named_and_nothing_is_lost(

@@ -234,3 +234,42 @@ def test_one_corner_of_the_image_is_not_enough() -> None:
             coverage.add(_ball(name, 0.1 * moment + 0.01 * index, (-0.3, -0.3, 1.5)))
     assert not coverage.enough
     assert "in the image of" in coverage.advice() or "nearer" in coverage.advice()
+
+
+def test_the_calibration_in_use_is_taken_up_again_for_further_steps(
+    store: CalibrationStore,
+) -> None:
+    """A step that was advised after a success began a new calibration without saying so."""
+    assert store.reopen() is None
+    used, later = (_finished(store, day) for day in (1, 2))
+    store.use(used)
+    assert store.reopen() == used
+    again = Session.load(store.unfinished)
+    assert again.done(EMPTY)
+    assert again.background("front-lower") is not None
+    again.record_resting("around-0", [_ball("front-lower", 1.0)])
+    assert store.finish(_rig(3), {}).name == "20261103T100000Z"
+    assert not Session.load(store.folder / used).around
+    assert {entry.name for entry in store.entries()} == {used, later, "20261103T100000Z"}
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"step": "wall-0", "planes": [{"camera": "front-lower"}]}, "patches"),
+        ({"step": "wall-0", "planes": [{"camera": "front-lower", "surface": "wall-0",
+          "points": 9, "patches": np.zeros((0, 4)).tolist()}]}, "numbers were expected"),
+        ({"step": "wall-0", "planes": [{"camera": "front-lower", "surface": "wall-0",
+          "points": 9, "patches": [[1.0, 2.0, 0.5, 1e-7]]}]}, "3 patches are needed, not 1"),
+        ({"step": "wall-0", "planes": [{"camera": "side", "surface": "wall-0",
+          "points": 9, "patches": [[1.0, 2.0, 0.5, 1e-7]] * 3}]}, "there is no camera side"),
+    ],
+)  # fmt: skip
+def test_a_damaged_line_is_named(
+    store: CalibrationStore, entry: dict[str, object], words: str
+) -> None:
+    """Some ended in a traceback when the calibration was solved."""
+    session = Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
+    (session.folder / JOURNAL).write_text(json.dumps(entry) + "\n")
+    with pytest.raises(FormatError, match=f"line 1 cannot be read .*{words}"):
+        Session.load(session.folder)

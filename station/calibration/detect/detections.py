@@ -28,6 +28,8 @@ EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND = (
 """Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
 "stand-1700" by the height in millimetres."""
 FLOOR = "floor"
+_FEWEST_PATCHES = 3
+"""Fewer do not make a plane."""
 _RADIUS_CERTAIN = 0.045
 """Largest standard deviation of a detection's own radius, as a share of the radius, ..."""
 _COVERED_CERTAIN, _COVERED = 0.034, 1.1
@@ -150,11 +152,14 @@ class PlaneObservation:
             FormatError: a field is missing or is not what it should be.
         """
         try:
+            patches = _numbers(document["patches"], (None, 4))
+            if len(patches) < _FEWEST_PATCHES:
+                raise ValueError(f"{_FEWEST_PATCHES} patches are needed, not {len(patches)}")
             return cls(
                 camera=str(document["camera"]),
                 surface=str(document["surface"]),
                 points=int(document["points"]),
-                patches=_numbers(document["patches"], (None, 4)),
+                patches=patches,
             )
         except (KeyError, TypeError, ValueError) as cause:
             raise FormatError(f"a plane observation cannot be read ({cause})") from None

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
 
 
+_INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended, as in a shell."""
+
+
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that all steps share; the command gets the procedure."""
 
@@ -54,8 +58,12 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         procedure = Procedure(config, store, recordings, guide)
         if kwargs.get("list_them"):
             return command(procedure, *args, **kwargs)
-        with store.locked():
-            return command(procedure, *args, **kwargs)
+        try:
+            with store.locked():
+                return command(procedure, *args, **kwargs)
+        except (KeyboardInterrupt, click.Abort):
+            guide.say("stopped; what was seen is kept: station calibrate goes on from here")
+            raise SystemExit(_INTERRUPTED) from None
 
     return wrapped
 
@@ -68,14 +76,16 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: bool) -> None:
     """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
 
-    Without a step all of them are done, guided, from where the last attempt ended. Every result is
-    a dated folder; the previous ones are kept.
+    Without a step all of them are done, guided, from where the last attempt ended. A step by itself
+    adds to the calibration that is being done, or else to the one in use; solve then puts the
+    result into use. Every result is a dated folder; the previous ones are kept.
 
     \b
     Examples:
       station calibrate                       guided, all steps
       station calibrate ball                  wave the ball a little longer
-      station calibrate solve                 solve again from what was seen
+      station calibrate around                lay the ball at more places, then ...
+      station calibrate solve                 ... solve again from all that was seen
       station calibrate --list
       station calibrate --use 20261121T100000Z
     """
@@ -91,14 +101,22 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
 
 
 def _list(procedure: Procedure) -> None:
+    from station.calibration.solve.refusals import SIGMAS_95
+
     entries, session = list(procedure.store.entries()), procedure.unfinished_session()
     if not entries and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
         mark = "*" if entry.in_use else " "
+        found, accuracy = entry.rig.predicted, ""
+        if found is not None:
+            accuracy = (
+                f"; heights to {1e3 * SIGMAS_95 * found.height_sigma_m:.1f} mm, girths to "
+                f"{1e3 * SIGMAS_95 * found.girth_sigma_m:.1f} mm"
+            )
         click.echo(
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
-            f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms"
+            f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms{accuracy}"
         )
     if session is not None:
         click.echo(f"  unfinished, started {session.started}: {session.summary()}")

@@ -27,6 +27,8 @@ from station.core.errors import CalibrationError
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND)
 _SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
+_SURE_OF_RADIUS = 60
+"""Sightings from which on a ball of another radius is told."""
 _BOARDS = 3
 """Places of the board that a calibration asks for; a fourth buys next to nothing."""
 _STAND_M = (0.3, 2.2)
@@ -72,6 +74,17 @@ class Procedure:
             )
         return session
 
+    def _added_to(self) -> Session | None:
+        """The calibration that a further step adds to: the one that is being done, or else the one
+        in use, taken up again."""
+        if self.unfinished_session() is None and (name := self.store.reopen()):
+            self.guide.say(
+                f"added to what calibration {name} was solved from; station calibrate solve puts "
+                "the result into use. If a camera was moved since, begin anew: "
+                "station calibrate --new"
+            )
+        return self.unfinished_session()
+
     def run(self) -> None:
         """All steps that are not done yet."""
         self._check_recordings()
@@ -83,7 +96,7 @@ class Procedure:
             )
         if session is None or not session.done(EMPTY):
             self.empty()
-        if session is None or not coverage_so_far(session, self.config.reference).enough:
+        if session is None or not self._waved(session):
             self.ball()
         if session is None or not session.done(MARK):
             self.rest(MARK)
@@ -96,6 +109,18 @@ class Procedure:
         if session is None or session.wall_count < _BOARDS:
             self.walls(asked=True)
         self.solve()
+
+    def _waved(self, session: Session) -> bool:
+        """Whether the ball was waved enough, or as long as is asked for: then a camera may lack
+        something that more of it would not show."""
+        coverage = coverage_so_far(session, self.config.reference)
+        if coverage.enough or session.waved_s < self.config.calibrate.waving_s:
+            return coverage.enough
+        self.guide.say(
+            f"  the ball was waved for {session.waved_s} s; more of it would help (station "
+            f"calibrate ball): {coverage.advice()}"
+        )
+        return True
 
     def _check_recordings(self) -> None:
         """Recorded steps are of all cameras: one that is missing is not found out minutes later."""
@@ -135,7 +160,7 @@ class Procedure:
             wave_ball(
                 feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
             )
-        if coverage_so_far(session, self.config.reference).enough:
+        if len(session.balls) > _SURE_OF_RADIUS:
             from station.calibration.solve.refusals import check_radius
 
             check_radius(session.balls, session.radius_m)
@@ -147,12 +172,13 @@ class Procedure:
 
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
-        session = self.unfinished_session()
+        session = self._added_to()
         before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MAX_PLACES):
             step = f"{AROUND}-{place}"
             if self.recordings is not None:
                 if not (self.recordings / step).is_dir():
+                    self._check_recorded(step, wanted=place == before and not asked)
                     return
             elif place >= len(_AROUND) and (
                 asked or (place > before and not self.guide.answers_yes("Lay it at another place?"))
@@ -162,6 +188,12 @@ class Procedure:
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
 
+    def _check_recorded(self, step: str, *, wanted: bool) -> None:
+        if wanted:
+            raise CalibrationError(
+                f"{self.recordings} holds no recording of the step {step}: check the folder's name"
+            )
+
     def stands(self) -> None:
         """The ball on a stand, at two heights that the operator gives; at all that are recorded."""
         if self.recordings is not None:
@@ -169,7 +201,7 @@ class Procedure:
                 millimetres = folder.name.removeprefix(f"{STAND}-")
                 self.stand(1e-3 * int(millimetres) if millimetres.isdecimal() else float("nan"))
             return
-        session = self.unfinished_session()
+        session = self._added_to()
         before = session.stand_count if session else 0
         if self.guide.attended and before < len(_STANDS):
             self.guide.title("Ball on a stand")
@@ -199,14 +231,16 @@ class Procedure:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
         recorded."""
         # Live, a further board is added to those that were seen; recordings have their own places.
-        session = self.unfinished_session()
+        session = self._added_to()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
         live = self.recordings is None
         before = session.wall_count if live else 0
         for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
             if self.recordings is not None:
-                if not (self.recordings / f"{WALL}-{place}").is_dir():
+                step = f"{WALL}-{place}"
+                if not (self.recordings / step).is_dir():
+                    self._check_recorded(step, wanted=place == before and not asked)
                     return
             elif not self._board_stands(place, first=place == before, asked=asked):
                 return
@@ -287,7 +321,7 @@ class Procedure:
             source = replayed_feed(self.config, self.recordings / step)
         with source as feed:
             cameras = feed.cameras(_SENSORS_S)
-            session = self.unfinished_session()
+            session = self.unfinished_session() if step == EMPTY else self._added_to()
             if session is None:
                 session = Session.begin(
                     self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras
@@ -303,7 +337,8 @@ class Procedure:
             raise CalibrationError(
                 f"the calibration that was started at {session.started} uses a ball with a radius "
                 f"of {session.radius_m:g} m, but booth.toml says {radius_m:g} m "
-                "(calibrate.ball_radius_m); correct it, or start again with station calibrate --new"
+                "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
+                "with station calibrate --new"
             )
 
 

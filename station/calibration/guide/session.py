@@ -13,7 +13,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,8 @@ FORMAT = "booth-calibration-session"
 VERSIONS = frozenset({1})
 SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
+
+Seen = TypeVar("Seen", BallDetection, PlaneObservation)
 
 _SAME_STAND_M = 0.15
 """Heights of the stand that are nearer to each other are a measurement and its correction."""
@@ -145,6 +147,11 @@ class Session:
         if step == WALL:
             return any(name.startswith(WALL) for name in self.planes)
         return step in self.planes
+
+    @property
+    def waved_s(self) -> int:
+        """Seconds in which the waved ball was seen."""
+        return len({int(ball.time_s) for ball in self.balls})
 
     def summary(self) -> str:
         """Summary of the observations so far, for the operator."""
@@ -254,22 +261,37 @@ class Session:
         elif step == "forget-balls":
             self.balls.clear()
         elif step == BALL:
-            seen = [BallDetection.from_json(ball) for ball in entry["balls"]]
+            seen = self._balls(entry)
             later_s = self._moved_by(min(ball.time_s for ball in seen))
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
-            setattr(self, step, [BallDetection.from_json(ball) for ball in entry["balls"]])
+            setattr(self, step, self._balls(entry))
         elif step.startswith((AROUND, STAND)):
             for other in [name for name in self.around if _same_stand(name, step)]:
                 del self.around[other]
-            self.around[step] = [BallDetection.from_json(ball) for ball in entry["balls"]]
+            self.around[step] = self._balls(entry)
         elif step == "board":
             for name, lens in entry["lenses"].items():
                 self.lenses.pop(str(name), None)
                 if lens is not None:
                     self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
         else:
-            self.planes[step] = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
+            planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
+            self.planes[step] = self._known(planes)
+
+    def _balls(self, entry: Mapping[str, Any]) -> list[BallDetection]:
+        return self._known([BallDetection.from_json(ball) for ball in entry["balls"]])
+
+    def _known(self, seen: list[Seen]) -> list[Seen]:
+        """The same, if all are of cameras of this calibration.
+
+        Raises:
+            ValueError: one is not.
+        """
+        for one in seen:
+            if one.camera not in self.cameras:
+                raise ValueError(f"there is no camera {one.camera}")
+        return seen
 
     def _moved_by(self, first_s: float) -> float:
         """Shift of a run's times that puts it after the runs before."""

@@ -163,7 +163,7 @@ def wave_ball(
 ) -> None:
     """Keep the ball on its way through the booth, until the time is over and it is enough.
 
-    What was seen is on disk within a second; Ctrl-C ends the step and keeps it.
+    What was seen is on disk within a second, whatever ends the step.
     """
     coverage = coverage_so_far(session, reference)
     session.begin_run()
@@ -206,8 +206,6 @@ def wave_ball(
                 write()
                 guide.progress(f"looking for the ball in {finder.waiting} more frames")
                 time.sleep(_LOOK_EVERY_S)
-        except KeyboardInterrupt:
-            guide.say("stopped; what was seen is kept")
         finally:
             write()
     if feed.replays and feed.missed:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from station.calibration.detect.scene import StaticView
-from station.calibration.guide.session import SCENE
+from station.calibration.guide.session import SCENE, SESSION
 from station.core.errors import CalibrationError
 from station.core.files import (
     entries_of,
@@ -109,6 +109,20 @@ class CalibrationStore:
         except FileExistsError as cause:
             raise CalibrationError(f"{cause}; solve again in a second") from None
         return Entry(final.name, final, rig, in_use=False)
+
+    def reopen(self) -> str | None:
+        """Take up the calibration in use again, for further steps; its name.
+
+        None if there is none, or what it was solved from is not kept.
+        """
+        name = self.name_in_use()
+        if not name or not (self.folder / name / SESSION).exists():
+            return None
+        copy = private_folder(self.folder / f".{UNFINISHED}.{os.getpid()}")
+        seen = shutil.ignore_patterns(CALIBRATION, REPORT)
+        shutil.copytree(self.folder / name, copy, ignore=seen, dirs_exist_ok=True)
+        publish_folder(copy, self.unfinished)
+        return name
 
     def set_aside(self) -> Path | None:
         """Make room for a new calibration; what an unfinished one has seen is kept."""

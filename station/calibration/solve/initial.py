@@ -25,6 +25,7 @@ _RADIUS_ALIKE = 0.05
 _RADIUS_SLACK = 0.10
 """Distance from the stated radius: a depth error of 1 % changes it by 1 %."""
 _MIN_AT_REST = 5
+_LONGEST_GAP_S = 10.0
 _PATH_WEIGHT = 1e6
 """1/m^2: a first path passes its points within a millimetre, ..."""
 _SINGLE_WEIGHT = 6e4
@@ -158,6 +159,18 @@ def _facing(surface: Surface, poses: Mapping[str, Array]) -> tuple[Array, float]
 
 def _one_plane(view: tuple[Array, float], other: tuple[Array, float]) -> bool:
     return bool(view[0] @ other[0] > _SAME_COSINE and abs(view[1] - other[1]) < _SAME_DISTANCE_M)
+
+
+def without_gaps(balls: Sequence[BallDetection]) -> list[BallDetection]:
+    """The detections in the order of time, at times in which long gaps are shorter: what nobody saw
+    takes no memory."""
+    found = sorted(balls, key=lambda ball: ball.time_s)
+    gaps_s = np.diff([ball.time_s for ball in found], prepend=found[0].time_s if found else 0.0)
+    earlier_s = np.cumsum(np.maximum(0.0, gaps_s - _LONGEST_GAP_S))
+    return [
+        replace(ball, time_s=ball.time_s - float(shift))
+        for ball, shift in zip(found, earlier_s, strict=True)
+    ]
 
 
 def resting_places(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import BallDetection, Observations
+from station.calibration.detect.detections import FRONT, MARK, BallDetection, Observations
 from station.calibration.solve import clocks
 from station.calibration.solve.acceptance import HeldOut, resting_offsets
 from station.calibration.solve.initial import Detections
@@ -34,6 +34,8 @@ CONVERGED, DIVERGED = 0.3, 10.0
 can still name the faulty camera."""
 _RESTING_OFF_M = 0.002
 """Mean over the places; .1 to 1.0 mm in sound booths, 4 of a camera that was moved by 5."""
+_FRONT_M = 0.2
+"""Least distance of the ball in front of the mark from it."""
 _MARK_TOLERANCE_M = 0.008
 _SURELY_WRONG = 0.5
 """Probability from which on something is wrong of what people said of the resting ball."""
@@ -42,6 +44,7 @@ _LARGEST_SLOPE_RAD = np.radians(0.15)
 SIGMAS_95 = 1.96
 _WAVE_AGAIN = "fix it, and wave the ball again from the beginning (station calibrate ball --again)"
 STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
+BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
     "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
     "sees it (station calibrate around)"
@@ -273,6 +276,15 @@ def check_unmoved(problem: Problem, state: State) -> None:
             f"camera {name} sees the resting ball {1e3 * off_m[name]:.0f} mm away from where the "
             "others see it, but not the waved one: it, or one beside it, was moved in between; fix "
             "it, and start again with station calibrate --new"
+        )
+
+
+def check_front(places: Mapping[str, Array]) -> None:
+    """Refuse a ball that was not moved off the mark: it says nothing of where people face."""
+    if FRONT in places and np.linalg.norm(places[FRONT] - places[MARK]) < _FRONT_M:
+        raise CalibrationError(
+            "the ball in front of the mark lay where it lay on the mark: lay it 0.5 m in front, "
+            "and run station calibrate mark --front"
         )
 
 

@@ -26,6 +26,7 @@ from station.calibration.detect.detections import (
     FLOOR,
     FRONT,
     MARK,
+    WALL,
     Observations,
     stand_height_m,
 )
@@ -42,10 +43,11 @@ from station.calibration.solve.initial import (
     resting_sightings,
     sorted_detections,
     spread_m,
+    without_gaps,
 )
 from station.calibration.solve.pairwise import chain_poses, estimate_pairs
 from station.calibration.solve.predicted import predict_errors
-from station.calibration.solve.refusals import Limits
+from station.calibration.solve.refusals import SIGMAS_95, Limits
 from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 from station.core.rig import CameraCalibration, PredictedError, Rig
@@ -95,8 +97,8 @@ class Solution:
         if self.rig.predicted is not None:
             lines.append(
                 "from the calibration alone, heights are accurate to "
-                f"{2e3 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
-                f"{2e3 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
+                f"{1e3 * SIGMAS_95 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
+                f"{1e3 * SIGMAS_95 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
             )
         slope_deg = np.degrees(self.world_poses.slope_sigma_rad)
         lines.append(f"the floor's slope is known to within {slope_deg:.2f} degrees")
@@ -152,8 +154,9 @@ def solve(
     # One BLAS thread: other processes use the second core, and more threads wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         progress("checking the detections")
+        observations = replace(observations, balls=without_gaps(observations.balls))
         coverage = Coverage(cameras, reference, radius_m)
-        for ball in sorted(observations.balls, key=lambda ball: ball.time_s):
+        for ball in observations.balls:
             coverage.add(ball)
         refusals.check_counts(coverage)
         measured_m = refusals.check_radius(observations.balls, radius_m)
@@ -212,8 +215,10 @@ def _advice(
 ) -> tuple[str, ...]:  # fmt: skip
     """Sentences on what could be better."""
     weak = [] if coverage.enough else [coverage.advice()]
-    if refusals.SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
+    if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m or not problem.heights_m:
         weak.append(f"for heights, {refusals.remedy(bool(problem.heights_m))}")
+    if not any(surface.surface.startswith(WALL) for surface in problem.surfaces):
+        weak.append(f"for girths, {refusals.BOARD_WORDS}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
         weak.append(f"for the floor's slope, {refusals.slope_words(_laid(problem))}")
     return tuple(weak)
@@ -277,6 +282,7 @@ def _problem(
             "no camera saw the ball rest on the mark; put it there and leave the booth for the "
             "two seconds that this step takes"
         )
+    refusals.check_front(resting_places(resting, poses))
     heights_m = {
         place: height_m for place in resting if (height_m := stand_height_m(place)) is not None
     }
