@@ -339,12 +339,12 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
     problem = cause.errors()[0]
     key = _key((*place, *problem["loc"]))
     if problem["type"] == "extra_forbidden":
-        section: Any = model
+        at: Any = model
         for part in problem["loc"][:-1]:
-            many = isinstance(part, int)
-            section = section.__args__[0] if many else section.model_fields[part].annotation
-        return f"unknown key {key}; allowed here: {', '.join(section.model_fields)}"
+            at = at.__args__[0] if isinstance(part, int) else at.model_fields[part].annotation
+        return f"unknown key {key}; allowed here: {', '.join(at.model_fields)}"
     if problem["type"] == "missing":
         return f"{key} is missing"
-    said = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    return f"{key}: {said.replace('valid tuple', 'list')} (found {problem['input']!r:.80})"
+    said = problem["msg"].removeprefix("Value error, ").replace("Tuple should", "Input should")
+    said = said.replace("Input should", "must").replace("valid tuple", "list")
+    return f"{key}: {said} (found {problem['input']!r:.80})"

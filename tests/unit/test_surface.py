@@ -15,7 +15,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import attached
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prior
-from workers.scape.surface.uncertainty import surface_sigma
+from workers.scape.surface.uncertainty import hidden_head_sigma, surface_sigma
 
 Array = NDArray[np.float64]
 
@@ -118,3 +118,16 @@ def test_a_missing_limb_is_known_the_less_the_farther_it_reaches(model: BodyMode
     seen = model.mean[:, 2] > 0.9
     sigma = surface_sigma(model, seen, np.full(model.vertex_count, 0.001), seen)
     assert sigma[model.mean[:, 2] < 0.1].min() > 0.005
+
+
+def test_hair_hides_the_skin_below_the_top_as_well() -> None:
+    """Chin and girths of the head were stated as if only the top were doubtful."""
+    model = load_model()
+    head = model.part_of_vertex == model.part_names.index("head")
+    face = model.mean[:, 1] < np.median(model.mean[head, 1])
+    seen = ~head | face
+    sigma_m = hidden_head_sigma(model, seen, 0.011)
+    assert not sigma_m[~head | seen].any()
+    low = model.mean[:, 2] < model.mean[head, 2].max() - 0.1
+    assert 1e-4 < sigma_m[head & ~seen & low].max() < 2.0 * 0.011
+    assert not hidden_head_sigma(model, seen, 0.0).any()

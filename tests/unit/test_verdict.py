@@ -43,9 +43,14 @@ def _elbow_bent(model: BodyModel, degrees: float) -> Array:
     return model.vertices(state)
 
 
-def _verdict(model: BodyModel, lost: dict[str, str], shifts: dict[str, float]):  # type: ignore[no-untyped-def]
-    sides = {"front": 0.9, "back": 0.9}
-    return judge((), sides, (), lost, 1.75, np.zeros(model.beta_count), shifts, 1e-3)
+def _verdict(  # type: ignore[no-untyped-def]
+    model: BodyModel,
+    lost: dict[str, str],
+    shifts: dict[str, float],
+    misplaced: dict[str, str] | None = None,
+):
+    sides, beta = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count)
+    return judge((), sides, (), lost, 1.75, beta, shifts, 1e-3, misplaced or {})
 
 
 def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:
@@ -65,12 +70,18 @@ def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:
 def test_an_arm_that_the_fit_put_into_the_trunk_is_named(model: BodyModel) -> None:
     assert arms_inside(model, model.mean) == {}
     twists = np.zeros((model.part_count, 3))
-    twists[model.part_names.index("upper_arm_left"), 1] = np.radians(60.0)
-    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
-    verdict = _verdict(model, arms_inside(model, model.vertices(state)), {})
-    assert verdict.status == "rescan"
-    assert "the left forearm was not found" in verdict.reasons[0]
-    assert set(verdict.missing) == {"upper_arm_left", "forearm_left", "hand_left"}
+    for arms in (("left",), ("left", "right")):
+        for side in arms:
+            sign = 1.0 if side == "left" else -1.0
+            twists[model.part_names.index(f"upper_arm_{side}"), 1] = sign * np.radians(60.0)
+        state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+        verdict = _verdict(model, {}, {}, arms_inside(model, model.vertices(state)))
+        assert verdict.status == "rescan"
+        # Of two arms it said that too much of the scan did not match a body.
+        assert len(verdict.reasons) == len(arms)
+        assert "forearm was not found" in verdict.reasons[0]
+        parts = ("upper_arm", "forearm", "hand")
+        assert set(verdict.missing) == {f"{part}_{side}" for part in parts for side in arms}
 
 
 def _rotations(model: BodyModel, part: str, twist: tuple[float, float, float]) -> Array:
@@ -83,7 +94,7 @@ def test_a_head_bent_onto_the_chest_was_not_found(model: BodyModel) -> None:
     """Without a reading of the head the fit bent the neck to the stump, and all of it was seen."""
     assert head_turned(model, _rotations(model, "neck", (-0.4, 0.1, 0.0))) == {}
     lost = head_turned(model, _rotations(model, "neck", (-1.0, 0.3, 0.0)))
-    verdict = _verdict(model, lost, {})
+    verdict = _verdict(model, {}, {}, lost)
     assert verdict.reasons == ("the head was not found: look straight ahead",)
     assert verdict.missing == ("head",)
 
@@ -96,10 +107,15 @@ def test_a_lean_is_a_reason(model: BodyModel) -> None:
 
 
 def test_readings_that_scatter_are_the_reason_where_there_is_no_other(model: BodyModel) -> None:
-    scatter = "the readings lie 12 mm from the body; run: station check"
-    for stature_m, first in ((1.75, scatter), (1.0, "the person is 1.00 m tall")):
+    scatter = "the readings lie 12 mm from the body; "
+    cameras = {"front-lower": 0.0}
+    for stature_m, shifts, first in (
+        (1.75, cameras, scatter + "run: station check"),
+        (1.75, {}, scatter + "clean the cloud"),
+        (1.0, cameras, "the person is 1.00 m tall"),
+    ):
         sides, beta = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count)
-        verdict = judge((), sides, (), {}, stature_m, beta, {}, 0.0123)
+        verdict = judge((), sides, (), {}, stature_m, beta, shifts, 0.0123)
         assert len(verdict.reasons) == 1
         assert verdict.reasons[0].startswith(first)
 

@@ -233,15 +233,12 @@ def separate_limbs(
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
     findings = [*findings, *leaning(model, rotations)]
-    lost = {
-        **head_turned(model, rotations),
-        **arms_inside(model, fit.vertices),
-        **lost_parts(model, fit.patches),
-    }
+    misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
+    lost = lost_parts(model, fit.patches)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts, rms_m)
+    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts, rms_m, misplaced)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +62,10 @@ half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck", "head")
 _CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
 """Parts of a limb, outwards."""
-_SCATTER_M = 0.004
+_SCATTER_M = 0.006
 """Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
-sound scans, 12 where each point is 30 mm off."""
+sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
+_NONE: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,21 +181,24 @@ def judge(
     beta: Array,
     camera_shifts_m: dict[str, float],
     rms_m: float,
+    misplaced: Mapping[str, str] = _NONE,
 ) -> Verdict:
     """Decide whether to scan again.
 
     Args:
         sides: what `sides_seen` gives.
         findings: what preprocessing and `leaning` noticed; each is a reason.
-        lost: what `lost_parts`, `arms_inside` and `head_turned` give.
+        lost: what `lost_parts` gives.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
         rms_m: distance of the points from the surface.
+        misplaced: what `head_turned` and `arms_inside` give.
     """
     unseen = _unseen_parts(parts)
     moved, notes = _moved_cameras(camera_shifts_m)
     halves = _unseen_sides(sides)
     everywhere = _limbs_lost(lost) > 1
+    lost = {**misplaced, **lost}
     reasons = [finding.message for finding in findings] + moved + _unlike_people(stature_m, beta)
     if everywhere:
         reasons.append("too much of the scan does not match a body: nothing can be measured")
@@ -203,7 +208,8 @@ def judge(
     else:
         reasons += unseen.values()
     if not reasons and rms_m > _SCATTER_M:
-        reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; run: station check")
+        remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
+        reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
     missing = [*(name for name in lost if name), *unseen]
     if reasons:
         missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
