@@ -19,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from station.calibration.adjust.contacts import Belief, Contacts, beliefs
+from station.calibration.adjust.mixture import Mixture
 from station.calibration.adjust.priors import priors, shape_precision
 from station.calibration.adjust.problem import (
     Doubt,
@@ -58,7 +59,7 @@ _UNLIKELY = 7.0
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    best = max(_smooth_choices(_Base.of(problem, state)), key=lambda one: one.best[1])
+    best = _smooth_choices(_Base.of(problem, state))[0]
     return best.widths(best.best[0])
 
 
@@ -67,40 +68,41 @@ def averaged_state(problem: Problem, state: State) -> State:
     layout = Layout.of(problem)
     contacts = Contacts.of(problem, layout, state)
     sure, *doubtful = beliefs(problem)
-    found = [(sure, one) for one in _smooth_choices(_Base.of(problem, state, contacts, sure))]
-    smooth = [one for _, one in _likely(found)]
+    mixture = Mixture(layout.size)
+    smooth = []
+    for one in _smooth_choices(_Base.of(problem, state, contacts, sure)):
+        if _add(mixture, sure, one):
+            smooth.append((one.levels, one.best[0]))
     for belief in doubtful:
         base = _Base.of(problem, state, contacts, belief)
-        found += [(belief, _SmoothChoice(base, one.levels, one.best[0])) for one in smooth]
-    likely = _likely(found)
-    logs = np.array([one.log_evidence() for _, one in likely])
-    weights = np.exp(logs - logsumexp(logs))
-    moments = [one.moments() for _, one in likely]
-    mean = sum((w * step for w, (step, _) in zip(weights, moments, strict=True)), np.zeros(1))
-    covariance = np.zeros((layout.size, layout.size))
-    doubts = {belief: Doubt(belief.wrong, 0.0, 0.0) for belief in doubtful}
-    for (belief, _), weight, (step, spread) in zip(likely, weights, moments, strict=True):
-        covariance += weight * (spread + np.outer(step - mean, step - mean))
-        if belief.wrong:
-            there = [contacts.places.index(place) for place in belief.wrong]
-            off_m = float(np.mean(contacts.off_m[there] + contacts.rows[there] @ step))
-            so_far = doubts[belief].probability
-            larger = off_m if weight > so_far else doubts[belief].off_m
-            doubts[belief] = Doubt(belief.wrong, so_far + float(weight), larger)
+        for levels, start in smooth:
+            _add(mixture, belief, _SmoothChoice(base, levels, start))
+    doubts = []
+    for belief in doubtful:
+        probability, step = mixture.share(belief)
+        off_m = dict(zip(contacts.places, contacts.off_m + contacts.rows @ step, strict=True))
+        there_m = float(np.mean([off_m[place] for place in belief.wrong]))
+        doubts.append(Doubt(belief.wrong, probability, there_m))
+    mean, covariance = mixture.moments()
     return replace(
         moved_state(problem, layout, state, mean),
         covariance=covariance,
-        doubts=sorted(doubts.values(), key=lambda doubt: -doubt.probability),
+        doubts=sorted(doubts, key=lambda doubt: -doubt.probability),
     )
 
 
-def _likely(found: Sequence[tuple[Belief, _SmoothChoice]]) -> list[tuple[Belief, _SmoothChoice]]:
-    top = max(one.best[1] for _, one in found)
-    return [one for one in found if one[1].best[1] > top - _UNLIKELY]
+def _add(mixture: Mixture, belief: Belief, one: _SmoothChoice) -> bool:
+    """Add choices that are likely enough, of those so far."""
+    log = one.log_evidence()
+    if log < mixture.top - _UNLIKELY:
+        return False
+    mixture.add(belief, log, *one.moments())
+    return True
 
 
 def _smooth_choices(base: _Base) -> list[_SmoothChoice]:
-    """The evidence for levels of depth fields and ball shape, climbed from the middle.
+    """The evidence for levels of depth fields and ball shape, climbed from the middle; the largest
+    first.
 
     Each search goes on from the best choice of the level before.
     """
@@ -114,7 +116,7 @@ def _smooth_choices(base: _Base) -> list[_SmoothChoice]:
                 found[near] = _SmoothChoice(base, near, found[here].best[0])
         best = max(found, key=lambda one: found[one].best[1])
         if best == here:
-            return list(found.values())
+            return sorted(found.values(), key=lambda one: -one.best[1])
         here = best
 
 
