@@ -28,9 +28,10 @@ _TAIL = 4.0
 _STAND_TAIL = 20.0
 """Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
 unexpected form must not push it aside."""
-_ONE_WRONG, _ALL_WRONG = 0.07, 0.03
-"""Probabilities that one place is not as it was said, and that all stands are wrong by the same
-amount: measured with a tape whose hook is loose, or from a carpet."""
+_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG = 0.01, 0.06, 0.05
+"""How likely it is, for one that all is as was said, that something lies under the ball at one
+place; that one stand was measured wrongly; and that all stands are wrong by the same amount:
+measured with a tape whose hook is loose, or from a carpet."""
 _ONE_WRONG_M, _ALL_WRONG_M = 0.015, 0.008
 """Standard deviations of these errors."""
 
@@ -83,13 +84,18 @@ class Contacts:
 
 def beliefs(problem: Problem) -> Sequence[Belief]:
     """All that may be wrong, one thing at a time, after the belief that nothing is."""
-    stands, places = tuple(problem.heights_m), tuple(problem.resting)
-    together = _ALL_WRONG if len(stands) > 1 else 0.0
-    found = [Belief((), 1.0 - _ONE_WRONG - together, 0.0)]
-    found += [Belief((place,), _ONE_WRONG / len(places), _ONE_WRONG_M) for place in places]
-    if together:
-        found.append(Belief(stands, together, _ALL_WRONG_M))
-    return found
+    stands = tuple(problem.heights_m)
+    odds: dict[tuple[str, ...], float] = {
+        (place,): _STAND_WRONG if place in stands else _FLOOR_WRONG for place in problem.resting
+    }
+    if len(stands) > 1:
+        odds[stands] = _ALL_WRONG
+    whole = 1.0 + sum(odds.values())
+    doubtful = (
+        Belief(wrong, odd / whole, _ONE_WRONG_M if len(wrong) == 1 else _ALL_WRONG_M)
+        for wrong, odd in odds.items()
+    )
+    return [Belief((), 1.0 / whole, 0.0), *doubtful]
 
 
 def contact_error_m(problem: Problem, state: State, place: str) -> float:
