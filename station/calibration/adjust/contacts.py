@@ -29,9 +29,9 @@ _STAND_TAIL = 20.0
 """Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
 unexpected form must not push it aside."""
 _FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG = 0.01, 0.06, 0.05
-"""How likely it is, for one that all is as was said, that something lies under the ball at one
-place; that one stand was measured wrongly; and that all stands are wrong by the same amount:
-measured with a tape whose hook is loose, or from a carpet."""
+"""Odds against all being as was said, of something that lies under the ball at one place, of one
+stand that was measured wrongly, and of all stands being wrong by the same amount: measured with a
+tape whose hook is loose, or from a carpet."""
 _ONE_WRONG_M, _ALL_WRONG_M = 0.015, 0.008
 """Standard deviations of these errors."""
 
