@@ -135,7 +135,7 @@ def trials(
             taken = sensor.frames(visit, true, frames)
             move, doubts = estimate_move(references[name], taken, DEPTH_SCALE_M), Doubts()
             named = doubts.confirmed(move)
-            if move.moved and not named:
+            if (move.moved or move.lost) and not named:
                 then = booth.scenes[(scan + 1) % len(booth.scenes)]
                 again = booth.visit(then, visit.seed + _AGAIN, visit.day)
                 taken = sensor.frames(again, true, frames)

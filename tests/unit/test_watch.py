@@ -136,6 +136,15 @@ def test_a_clear_alarm_does_not_wait() -> None:
     assert not doubts.confirmed(CameraMove("b", np.zeros(6), np.eye(6), 1.0))
 
 
+def test_a_view_that_is_hardly_met_waits_for_the_next_scan() -> None:
+    """A person and a chair near the camera left 13 % of the background; nothing had moved."""
+    doubts, filled = Doubts(), CameraMove("a", np.zeros(6), np.eye(6), 0.13)
+    assert not doubts.confirmed(filled)
+    assert not doubts.confirmed(_estimate(0.0))
+    assert not doubts.confirmed(filled)
+    assert doubts.confirmed(filled)
+
+
 def test_two_alarms_that_contradict_each_other_are_no_move() -> None:
     doubts = Doubts()
     assert not doubts.confirmed(_estimate(1.2))

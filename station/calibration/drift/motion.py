@@ -24,6 +24,8 @@ LEVER_M = MOVED_M / MOVED_RAD
 """Turns rotations into metres, so that both limits are one length."""
 MIN_SHARE = 0.15
 """Less of the stored background than this tells nothing."""
+_NOTHING_MET = 0.05
+"""Less than this is no person, bag and chair that fill a view: it needs no second scan."""
 _CERTAINTY = 2.0
 """A camera alarms if it is so many standard deviations from the nearest move within the tolerance
 ..."""
@@ -82,7 +84,7 @@ class CameraMove:
     @property
     def certain(self) -> bool:
         """One scan is enough to say so."""
-        return self.lost or self.alarm() > _AT_ONCE
+        return self.share < _NOTHING_MET or self.alarm() > _AT_ONCE
 
     def agrees(self, other: CameraMove) -> bool:
         """Whether both may be estimates of one move."""

@@ -1,7 +1,8 @@
 """Check of the cameras with every scan: its background against the calibration's empty booth.
 
 A camera that moved stays moved. What hardly alarms is therefore told only if the next scan says the
-same: alarms of cameras that stand still are hardly above the limit, and mostly single.
+same: alarms of cameras that stand still are hardly above the limit, and mostly single. So are views
+that a person and things fill.
 """
 
 from __future__ import annotations
@@ -31,8 +32,7 @@ class Doubts:
         before = self._last.pop(move.camera, None)
         if not (move.moved or move.lost):
             return False
-        if move.moved:
-            self._last[move.camera] = move
+        self._last[move.camera] = move
         return move.certain or (before is not None and move.agrees(before))
 
     def forget(self) -> None:
