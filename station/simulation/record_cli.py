@@ -104,6 +104,11 @@ def record_virtual(
         lines += ["[calibrate]", f"waving_s = {waving_s:g}", ""]
     (out_folder / "booth.toml").write_text("\n".join(lines))
     click.echo(out_folder / "booth.toml")
+    if waving_s is not None:
+        click.echo(
+            f"calibrate it: station calibrate --config {out_folder / 'booth.toml'} "
+            f"--recordings {out_folder / PROCEDURE}"
+        )
 
 
 def _record_person(

@@ -43,8 +43,8 @@ class _NoFeed:
     def __init__(self, *_: object) -> None:
         pass
 
-    def __enter__(self) -> tuple[None, None]:
-        return None, None
+    def __enter__(self) -> tuple[None, SimpleNamespace]:
+        return None, SimpleNamespace(balls=())
 
     def __exit__(self, *_: object) -> None:
         pass

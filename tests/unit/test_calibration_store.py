@@ -240,10 +240,11 @@ def test_the_calibration_in_use_is_taken_up_again_for_further_steps(
     store: CalibrationStore,
 ) -> None:
     """A step that was advised after a success began a new calibration without saying so."""
-    assert store.reopen() is None
+    assert store.resumable() is None
     used, later = (_finished(store, day) for day in (1, 2))
     store.use(used)
-    assert store.reopen() == used
+    assert store.resumable() == used
+    store.reopen(used)
     again = Session.load(store.unfinished)
     assert again.done(EMPTY)
     assert again.background("front-lower") is not None

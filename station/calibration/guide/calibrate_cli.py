@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
 
 
+_NOT_USED = "  kept, and not in use yet: station calibrate solve puts it into use"
 _INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended, as in a shell."""
 
@@ -46,26 +47,39 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
                 step = context.invoked_subcommand
                 raise click.UsageError(f"put options after the step: station calibrate {step} ...")
             return None
-        if not kwargs.get("list_them"):
-            click.echo("starting ...")
-        from station.calibration.guide.procedure import Procedure
-        from station.calibration.guide.store import CalibrationStore
-
-        config = load_config(find_config(config_path))
-        store = CalibrationStore(config.calibrate.folder, config.calibration)
-        attended = not yes and recordings is None
-        guide = Guide(attended, config.calibrate.countdown_s)
-        procedure = Procedure(config, store, recordings, guide)
-        if kwargs.get("list_them"):
-            return command(procedure, *args, **kwargs)
         try:
-            with store.locked():
-                return command(procedure, *args, **kwargs)
+            return _called(command, args, kwargs, config_path, recordings, yes)
         except (KeyboardInterrupt, click.Abort):
-            guide.say("stopped; what was seen is kept: station calibrate goes on from here")
+            click.echo("  stopped; what was seen is kept: station calibrate goes on from here")
             raise SystemExit(_INTERRUPTED) from None
 
     return wrapped
+
+
+def _called(
+    command: Callable[..., Any],
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    config_path: Path | None,
+    recordings: Path | None,
+    yes: bool,
+) -> Any:
+    if not kwargs.get("list_them"):
+        click.echo("starting ...")
+    from station.calibration.guide.procedure import Procedure
+    from station.calibration.guide.store import CalibrationStore
+
+    config = load_config(find_config(config_path))
+    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    attended = not yes and recordings is None
+    guide = Guide(attended, config.calibrate.countdown_s)
+    procedure = Procedure(config, store, recordings, guide)
+    if kwargs.get("list_them"):
+        return command(procedure, *args, **kwargs)
+    with store.locked():
+        result = command(procedure, *args, **kwargs)
+    guide.end_line()
+    return result
 
 
 @click.group(invoke_without_command=True)
@@ -132,6 +146,7 @@ def floor(procedure: Procedure) -> None:
       station calibrate floor
     """
     procedure.empty()
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("ball")
@@ -148,6 +163,7 @@ def ball(procedure: Procedure, again: bool) -> None:
     if again:
         procedure.session().forget_balls()
     procedure.ball()
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("mark")
@@ -164,6 +180,7 @@ def mark(procedure: Procedure, front: bool) -> None:
     from station.calibration.detect.detections import FRONT, MARK
 
     procedure.rest(FRONT if front else MARK)
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("around")
@@ -178,6 +195,7 @@ def around(procedure: Procedure) -> None:
       station calibrate around
     """
     procedure.around(asked=False)
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("stand")
@@ -201,6 +219,7 @@ def stand(procedure: Procedure, height_m: float) -> None:
       station calibrate stand --height 1.7
     """
     procedure.stand(height_m)
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("depth")
@@ -213,6 +232,7 @@ def depth(procedure: Procedure) -> None:
       station calibrate depth
     """
     procedure.walls(asked=False)
+    click.echo(_NOT_USED)
 
 
 @calibrate.command("solve")

@@ -70,18 +70,21 @@ class Procedure:
             raise CalibrationError(
                 "no calibration has been started; station calibrate goes through all steps"
                 if last is None
-                else f"the last calibration, {last}, is finished; station calibrate begins another"
+                else f"the last calibration, {last}, is finished; station calibrate begins "
+                "another, and a single step (ball, around, stand, depth) adds to it"
             )
         return session
 
     def _added_to(self) -> Session | None:
         """The calibration that a further step adds to: the one that is being done, or else the one
         in use, taken up again."""
-        if self.unfinished_session() is None and (name := self.store.reopen()):
+        name = self.store.resumable() if self.unfinished_session() is None else None
+        if name is not None:
+            self._check_radius(Session.load(self.store.folder / name))
+            self.store.reopen(name)
             self.guide.say(
-                f"added to what calibration {name} was solved from; station calibrate solve puts "
-                "the result into use. If a camera was moved since, begin anew: "
-                "station calibrate --new"
+                f"added to what calibration {name} was solved from; if a camera was moved since, "
+                "begin anew: station calibrate --new"
             )
         return self.unfinished_session()
 
@@ -90,7 +93,10 @@ class Procedure:
         self._check_recordings()
         session = self.unfinished_session()
         if session is not None:
-            self.guide.say(f"continuing the calibration that was started at {session.started}")
+            self.guide.say(
+                f"continuing the calibration that was started at {session.started}; if a camera "
+                "was moved since, begin anew: station calibrate --new"
+            )
             self.guide.say(
                 f"  already recorded: {session.summary()}; to repeat a step, run its own command"
             )
@@ -157,9 +163,8 @@ class Procedure:
             if self.recordings is not None and session.balls:
                 # The recording begins anew: what it shows twice was seen once.
                 session.forget_balls()
-            wave_ball(
-                feed, session, self.guide, reference=self.config.reference, lasts_s=wanted.waving_s
-            )
+            reference, lasts_s = self.config.reference, wanted.waving_s
+            wave_ball(feed, session, self.guide, reference=reference, lasts_s=lasts_s)
         if len(session.balls) > _SURE_OF_RADIUS:
             from station.calibration.solve.refusals import check_radius
 
@@ -177,8 +182,7 @@ class Procedure:
         for place in range(before, before + _MAX_PLACES):
             step = f"{AROUND}-{place}"
             if self.recordings is not None:
-                if not (self.recordings / step).is_dir():
-                    self._check_recorded(step, wanted=place == before and not asked)
+                if (asked or place > before) and not (self.recordings / step).is_dir():
                     return
             elif place >= len(_AROUND) and (
                 asked or (place > before and not self.guide.answers_yes("Lay it at another place?"))
@@ -187,12 +191,6 @@ class Procedure:
             where = _AROUND[place] if place < len(_AROUND) else "anywhere else around the mark"
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
-
-    def _check_recorded(self, step: str, *, wanted: bool) -> None:
-        if wanted:
-            raise CalibrationError(
-                f"{self.recordings} holds no recording of the step {step}: check the folder's name"
-            )
 
     def stands(self) -> None:
         """The ball on a stand, at two heights that the operator gives; at all that are recorded."""
@@ -238,10 +236,11 @@ class Procedure:
         before = session.wall_count if live else 0
         for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
             if self.recordings is not None:
-                step = f"{WALL}-{place}"
-                if not (self.recordings / step).is_dir():
-                    self._check_recorded(step, wanted=place == before and not asked)
+                recorded = (self.recordings / f"{WALL}-{place}").is_dir()
+                if (asked or place > before) and not recorded:
                     return
+                if place == before:
+                    self.guide.title("Flat board")
             elif not self._board_stands(place, first=place == before, asked=asked):
                 return
             with self._feed(f"{WALL}-{place}") as (feed, session):
@@ -317,8 +316,13 @@ class Procedure:
         """Frames for a step and the calibration that is being done; begun if there is none."""
         if self.recordings is None:
             source = live_feed(self.config)
-        else:
+        elif (self.recordings / step).is_dir():
             source = replayed_feed(self.config, self.recordings / step)
+        else:
+            known = ", ".join(sorted(path.name for path in self.recordings.iterdir()))
+            raise CalibrationError(
+                f"{self.recordings} holds no recording of the step {step}; it holds {known}"
+            )
         with source as feed:
             cameras = feed.cameras(_SENSORS_S)
             session = self.unfinished_session() if step == EMPTY else self._added_to()

@@ -27,6 +27,8 @@ _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
 _OTHERS_S = 3.0
 """After the first camera others have so long to see it at rest, too."""
+_LEAST_WAVED = 0.25
+"""Share of the whole time for which the ball is waved once more."""
 _WRITE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
 _OFTEN = 0.9
@@ -163,9 +165,11 @@ def wave_ball(
 ) -> None:
     """Keep the ball on its way through the booth, until the time is over and it is enough.
 
-    What was seen is on disk within a second, whatever ends the step.
+    What was seen is on disk within a second, whatever ends the step. Seconds in which the ball was
+    seen before count.
     """
     coverage = coverage_so_far(session, reference)
+    lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
     session.begin_run()
     resets: dict[str, int] = {}
     waiting: list[BallDetection] = []
@@ -204,7 +208,8 @@ def wave_ball(
             while finder.waiting:
                 keep(finder.found())
                 write()
-                guide.progress(f"looking for the ball in {finder.waiting} more frames")
+                if finder.waiting:
+                    guide.progress(f"looking for the ball in {finder.waiting} more frames")
                 time.sleep(_LOOK_EVERY_S)
         finally:
             write()

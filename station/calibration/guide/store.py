@@ -110,19 +110,17 @@ class CalibrationStore:
             raise CalibrationError(f"{cause}; solve again in a second") from None
         return Entry(final.name, final, rig, in_use=False)
 
-    def reopen(self) -> str | None:
-        """Take up the calibration in use again, for further steps; its name.
-
-        None if there is none, or what it was solved from is not kept.
-        """
+    def resumable(self) -> str | None:
+        """Name of the calibration in use, if what it was solved from is kept."""
         name = self.name_in_use()
-        if not name or not (self.folder / name / SESSION).exists():
-            return None
+        return name if name and (self.folder / name / SESSION).exists() else None
+
+    def reopen(self, name: str) -> None:
+        """Take up a stored calibration again, for further steps."""
         copy = private_folder(self.folder / f".{UNFINISHED}.{os.getpid()}")
         seen = shutil.ignore_patterns(CALIBRATION, REPORT)
         shutil.copytree(self.folder / name, copy, ignore=seen, dirs_exist_ok=True)
         publish_folder(copy, self.unfinished)
-        return name
 
     def set_aside(self) -> Path | None:
         """Make room for a new calibration; what an unfinished one has seen is kept."""

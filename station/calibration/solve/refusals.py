@@ -249,8 +249,8 @@ def check_doubts(problem: Problem, state: State) -> None:
         raise CalibrationError(
             f"the ball on the stand of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
             f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
-            "the floor again, and repeat that step; if it was right, let the sensors warm up and "
-            "wave the ball again"
+            "the floor again, and repeat that step (station calibrate stand --height ...); if it "
+            "was right, let the sensors warm up and wave the ball again"
         )
     raise CalibrationError(
         "the places of the ball on the floor do not lie on one floor (one is "
