@@ -137,7 +137,8 @@ def procedure_seconds(*, extras: bool) -> dict[str, float]:
         ),
     ):
         guide = Guide(attended=True, countdown_s=wanted.countdown_s)
-        Procedure(cast(Any, config), cast(Any, None), None, guide).run()
+        store = SimpleNamespace(resumable=lambda: None)
+        Procedure(cast(Any, config), cast(Any, store), None, guide).run()
     return operator.spent_s
 
 

@@ -216,3 +216,23 @@ def test_a_replay_speaks_within_a_second(config: Path, tmp_path: Path) -> None:
     assert words == "starting ...\n"
     ticks = int(fields[11]) + int(fields[12])
     assert ticks / os.sysconf("SC_CLK_TCK") < 1.0
+
+
+def test_a_step_that_fails_does_not_take_the_calibration_in_use_up_again(
+    config: Path, store: CalibrationStore
+) -> None:
+    """The next calibration would have been solved from what was seen before a camera was moved."""
+    session = _begin(store)
+    session.record_empty({}, [])
+    store.use(store.finish(replace(default_rig(), created="2026-11-01T10:00:00Z"), {}).name)
+    with pytest.raises(BoothError):
+        _raised(_run(config, "around", "--recordings", str(config.parent), "--yes"))
+    assert not store.unfinished.exists()
+    store.reopen("20261101T100000Z")
+    with pytest.raises(CalibrationError, match="station calibrate solve puts them into use"):
+        _raised(_run(config, "--yes"))
+
+
+def _raised(result: Result) -> None:
+    if result.exception is not None:
+        raise result.exception

@@ -244,8 +244,14 @@ def test_the_calibration_in_use_is_taken_up_again_for_further_steps(
     used, later = (_finished(store, day) for day in (1, 2))
     store.use(used)
     assert store.resumable() == used
-    store.reopen(used)
-    again = Session.load(store.unfinished)
+    # What a process left that was killed meanwhile, or while it began a calibration.
+    for left in (".unfinished.77", "unfinished"):
+        (store.folder / left / "scene").mkdir(parents=True)
+        (store.folder / left / "scene" / "ghost.npz").touch()
+    again = store.reopen(used)
+    assert again.adds_to == used
+    assert not list(store.folder.rglob(".unfinished*"))
+    assert [path.name for path in (store.unfinished / "scene").iterdir()] == ["front-lower.npz"]
     assert again.done(EMPTY)
     assert again.background("front-lower") is not None
     again.record_resting("around-0", [_ball("front-lower", 1.0)])

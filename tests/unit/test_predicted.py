@@ -11,7 +11,7 @@ import pytest
 from station.calibration.adjust.problem import Sightings
 from station.calibration.detect.coverage import Coverage
 from station.calibration.solve.acceptance import HeldOut, held_out_seconds, widen_by_test
-from station.calibration.solve.refusals import STAND_WORDS, Limits, check_predicted
+from station.calibration.solve.refusals import BOARD_WORDS, STAND_WORDS, Limits, check_predicted
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import PredictedError
@@ -79,16 +79,16 @@ def _nothing_seen() -> Coverage:
     ],
 )
 def test_what_could_spoil_sizes_is_refused(limits: Limits, words: str) -> None:
-    check_predicted(SAID, Limits(), _nothing_seen(), stood=False)
+    check_predicted(SAID, Limits(), _nothing_seen(), stood=False, boarded=False)
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, limits, _nothing_seen(), stood=False)
+        check_predicted(SAID, limits, _nothing_seen(), stood=False, boarded=False)
     assert words in str(raised.value)
-    assert STAND_WORDS in str(raised.value)
+    assert (STAND_WORDS if "heights" in words else BOARD_WORDS) in str(raised.value)
 
 
 def test_whoever_used_a_stand_is_not_told_to() -> None:
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), stood=True)
+        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), stood=True, boarded=True)
     assert "stand" not in str(raised.value).replace("understand", "")
     assert "wave the ball longer" in str(raised.value)
 

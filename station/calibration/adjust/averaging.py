@@ -68,15 +68,15 @@ def averaged_state(problem: Problem, state: State) -> State:
     layout = Layout.of(problem)
     contacts = Contacts.of(problem, layout, state)
     sure, *doubtful = beliefs(problem)
-    mixture = Mixture(layout.size)
+    mixture, base = Mixture(layout.size), _Base.of(problem, state)
     smooth = []
-    for one in _smooth_choices(_Base.of(problem, state, contacts, sure)):
+    for one in _smooth_choices(base.under(contacts, sure)):
         if _add(mixture, sure, one):
             smooth.append((one.levels, one.best[0]))
     for belief in doubtful:
-        base = _Base.of(problem, state, contacts, belief)
+        doubted = base.under(contacts, belief)
         for levels, start in smooth:
-            _add(mixture, belief, _SmoothChoice(base, levels, start))
+            _add(mixture, belief, _SmoothChoice(doubted, levels, start))
     doubts = []
     for belief in doubtful:
         probability, step = mixture.share(belief)
@@ -136,15 +136,11 @@ class _Base:
     shape: Indices
     shape_precision: Array
     radius_m: float
-    log_belief: float
+    log_belief: float = 0.0
     """Log-probability of a belief and of what it says of the contacts at the state."""
 
     @classmethod
-    def of(
-        cls, problem: Problem, state: State, contacts: Contacts | None = None,
-        belief: Belief | None = None,
-    ) -> _Base:  # fmt: skip
-        """Under a belief on the contacts; without one, they are weighed as in the solution."""
+    def of(cls, problem: Problem, state: State) -> _Base:
         layout, model = Layout.of(problem), problem.model
         information, gradient = state.information.copy(), state.gradient.copy()
         values = np.zeros(layout.size)
@@ -170,20 +166,23 @@ class _Base:
             block = prior.information * uncertain[:, None] * uncertain
             information[np.ix_(prior.index, prior.index)] -= block
             gradient[prior.index] -= block @ prior.values
-        log_belief = 0.0
-        if contacts is not None and belief is not None:
-            expected = contacts.covariance(belief)
-            weight, rows = np.linalg.inv(expected), contacts.rows
-            information += rows.T @ (weight - np.diag(contacts.weight)) @ rows
-            gradient += rows.T @ (weight @ contacts.off_m - contacts.weight * contacts.off_m)
-            log_belief = float(np.log(belief.probability))
-            log_belief -= 0.5 * float(np.linalg.slogdet(expected)[1])
-            log_belief -= 0.5 * float(contacts.off_m @ weight @ contacts.off_m)
         return cls(
             tuple(problem.cameras), information, gradient, values, groups, fields,
             model.field_precision, layout.shapes, shape_precision(problem, layout),
-            problem.radius_m, log_belief,
+            problem.radius_m,
         )  # fmt: skip
+
+    def under(self, contacts: Contacts, belief: Belief) -> _Base:
+        """The same under a belief on the contacts, which the solution weighs otherwise."""
+        expected, off_m, rows = contacts.covariance(belief), contacts.off_m, contacts.rows
+        weight = np.linalg.inv(expected)
+        log = float(np.log(belief.probability)) - 0.5 * float(np.linalg.slogdet(expected)[1])
+        return replace(
+            self,
+            information=self.information + rows.T @ (weight - np.diag(contacts.weight)) @ rows,
+            gradient=self.gradient + rows.T @ (weight @ off_m - contacts.weight * off_m),
+            log_belief=log - 0.5 * float(off_m @ weight @ off_m),
+        )
 
 
 class _SmoothChoice:

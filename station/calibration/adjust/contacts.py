@@ -1,8 +1,8 @@
 """Contacts of the resting ball: with the floor, or with a stand of measured height above it.
 
-That it does so is what people say, and they may be wrong: something lies under the ball, a height
-was misread. What may be wrong is a belief with a prior probability; the
-solution is averaged over all beliefs (`station.calibration.adjust.averaging`).
+People say that it lies there, and may be wrong: something is under the ball, a height was misread.
+What may be wrong is a belief with a prior probability; the solution is averaged over all beliefs
+(`station.calibration.adjust.averaging`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TAIL = 4.0
 _STAND_TAIL = 20.0
 """Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
 unexpected form must not push it aside."""
-_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG = 0.01, 0.06, 0.05
+_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG = 3e-4, 0.06, 0.05
 """Odds against all being as was said, of something that lies under the ball at one place, of one
 stand that was measured wrongly, and of all stands being wrong by the same amount: measured with a
 tape whose hook is loose, or from a carpet."""

@@ -75,23 +75,22 @@ class Procedure:
             )
         return session
 
-    def _added_to(self) -> Session | None:
-        """The calibration that a further step adds to: the one that is being done, or else the one
-        in use, taken up again."""
-        name = self.store.resumable() if self.unfinished_session() is None else None
-        if name is not None:
-            self._check_radius(Session.load(self.store.folder / name))
-            self.store.reopen(name)
-            self.guide.say(
-                f"added to what calibration {name} was solved from; if a camera was moved since, "
-                "begin anew: station calibrate --new"
-            )
-        return self.unfinished_session()
+    def _session_to_add_to(self) -> Session | None:
+        """The calibration that is being done, or else the one in use: a further step adds to it."""
+        session = self.unfinished_session()
+        if session is None and (used := self.store.resumable()):
+            return Session.load(self.store.folder / used)
+        return session
 
     def run(self) -> None:
         """All steps that are not done yet."""
         self._check_recordings()
         session = self.unfinished_session()
+        if session is not None and session.adds_to:
+            raise CalibrationError(
+                f"steps were added to calibration {session.adds_to}: station calibrate solve puts "
+                "them into use, station calibrate --new begins another"
+            )
         if session is not None:
             self.guide.say(
                 f"continuing the calibration that was started at {session.started}; if a camera "
@@ -120,10 +119,11 @@ class Procedure:
         """Whether the ball was waved enough, or as long as is asked for: then a camera may lack
         something that more of it would not show."""
         coverage = coverage_so_far(session, self.config.reference)
-        if coverage.enough or session.waved_s < self.config.calibrate.waving_s:
+        replayed = self.recordings is not None
+        if coverage.enough or replayed or session.waved_s < self.config.calibrate.waving_s:
             return coverage.enough
         self.guide.say(
-            f"  the ball was waved for {session.waved_s} s; more of it would help (station "
+            f"the ball was waved for {session.waved_s} s; more of it would help (station "
             f"calibrate ball): {coverage.advice()}"
         )
         return True
@@ -177,7 +177,7 @@ class Procedure:
 
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
-        session = self._added_to()
+        session = self._session_to_add_to()
         before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MAX_PLACES):
             step = f"{AROUND}-{place}"
@@ -199,7 +199,7 @@ class Procedure:
                 millimetres = folder.name.removeprefix(f"{STAND}-")
                 self.stand(1e-3 * int(millimetres) if millimetres.isdecimal() else float("nan"))
             return
-        session = self._added_to()
+        session = self._session_to_add_to()
         before = session.stand_count if session else 0
         if self.guide.attended and before < len(_STANDS):
             self.guide.title("Ball on a stand")
@@ -229,7 +229,7 @@ class Procedure:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
         recorded."""
         # Live, a further board is added to those that were seen; recordings have their own places.
-        session = self._added_to()
+        session = self._session_to_add_to()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
         live = self.recordings is None
@@ -275,7 +275,7 @@ class Procedure:
         from station.calibration.solve.solution import solve
 
         session = self.session()
-        self._check_radius(session)
+        session.check_radius(self.config.calibrate.ball_radius_m)
         self.guide.title("Solution")
         solution = solve(
             session.observations(),
@@ -325,25 +325,21 @@ class Procedure:
             )
         with source as feed:
             cameras = feed.cameras(_SENSORS_S)
-            session = self.unfinished_session() if step == EMPTY else self._added_to()
+            session = self.unfinished_session() if step == EMPTY else self._session_to_add_to()
             if session is None:
                 session = Session.begin(
                     self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras
                 )
             else:
                 session.check_cameras(cameras)
-                self._check_radius(session)
+                session.check_radius(self.config.calibrate.ball_radius_m)
+            if session.folder != self.store.unfinished:
+                session = self.store.reopen(session.folder.name)
+                self.guide.say(
+                    f"added to what calibration {session.adds_to} was solved from; if a camera was "
+                    "moved since, begin anew: station calibrate --new"
+                )
             yield feed, session
-
-    def _check_radius(self, session: Session) -> None:
-        radius_m = self.config.calibrate.ball_radius_m
-        if session.radius_m != radius_m:
-            raise CalibrationError(
-                f"the calibration that was started at {session.started} uses a ball with a radius "
-                f"of {session.radius_m:g} m, but booth.toml says {radius_m:g} m "
-                "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
-                "with station calibrate --new"
-            )
 
 
 def _now() -> str:

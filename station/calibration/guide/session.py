@@ -74,6 +74,8 @@ class Session:
     around: dict[str, list[BallDetection]] = field(default_factory=dict)
     """Place -> the ball resting on the floor there."""
     lenses: dict[str, Lens] = field(default_factory=dict)
+    adds_to: str = ""
+    """Name of the stored calibration that was taken up again."""
     runs: int = 0
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
@@ -89,6 +91,13 @@ class Session:
         # Written last: a folder without it was never begun.
         write_json(folder / SESSION, document)
         return cls(folder, started, radius_m, cameras)
+
+    @staticmethod
+    def note_origin(folder: Path, adds_to: str) -> None:
+        """Note in a folder which stored calibration it was copied from."""
+        path = folder / SESSION
+        document = read_json(path, format=FORMAT, versions=VERSIONS)
+        write_json(path, {**document, "adds_to": adds_to})
 
     @classmethod
     def load(cls, folder: Path) -> Session:
@@ -107,6 +116,7 @@ class Session:
                 f"{path} cannot be used ({cause}); start again with station calibrate --new"
             ) from None
         session = cls(folder, started, radius_m, sensors.cameras)
+        session.adds_to = str(document.get("adds_to", ""))
         session._replay_journal()
         return session
 
@@ -125,6 +135,20 @@ class Session:
                     f"when this calibration was started ({self.started}); start again with "
                     "station calibrate --new"
                 )
+
+    def check_radius(self, radius_m: float) -> None:
+        """Refuse to mix what was seen of two different balls.
+
+        Raises:
+            CalibrationError: the radius is another one.
+        """
+        if self.radius_m != radius_m:
+            raise CalibrationError(
+                f"the calibration that was started at {self.started} uses a ball with a radius of "
+                f"{self.radius_m:g} m, but booth.toml says {radius_m:g} m "
+                "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
+                "with station calibrate --new"
+            )
 
     def lensed_cameras(self) -> dict[str, CameraCalibration]:
         """The cameras, with the lenses that a board gave where it gave any."""

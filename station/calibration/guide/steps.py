@@ -180,8 +180,10 @@ def wave_ball(
         waiting.extend(balls)
 
     def write() -> None:
-        session.record_balls(waiting)
+        # Emptied first: whatever interrupts the writing, nothing is written twice.
+        seen = list(waiting)
         waiting.clear()
+        session.record_balls(seen)
 
     began_s = written_s = time.monotonic()
     with BallFinder(session, every_frame=feed.replays, held=True) as finder:

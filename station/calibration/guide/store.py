@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from station.calibration.detect.scene import StaticView
-from station.calibration.guide.session import SCENE, SESSION
+from station.calibration.guide.session import SCENE, SESSION, Session
 from station.core.errors import CalibrationError
 from station.core.files import (
     entries_of,
@@ -115,12 +115,18 @@ class CalibrationStore:
         name = self.name_in_use()
         return name if name and (self.folder / name / SESSION).exists() else None
 
-    def reopen(self, name: str) -> None:
+    def reopen(self, name: str) -> Session:
         """Take up a stored calibration again, for further steps."""
-        copy = private_folder(self.folder / f".{UNFINISHED}.{os.getpid()}")
-        seen = shutil.ignore_patterns(CALIBRATION, REPORT)
-        shutil.copytree(self.folder / name, copy, ignore=seen, dirs_exist_ok=True)
+        for left in self.folder.glob(f".{UNFINISHED}.*"):
+            shutil.rmtree(left)
+        # A calibration that was killed while it began has no session: nothing was seen in it.
+        self.set_aside()
+        copy = self.folder / f".{UNFINISHED}.{os.getpid()}"
+        solved = shutil.ignore_patterns(CALIBRATION, REPORT)
+        shutil.copytree(self.folder / name, copy, ignore=solved, copy_function=shutil.copyfile)
+        Session.note_origin(copy, name)
         publish_folder(copy, self.unfinished)
+        return Session.load(self.unfinished)
 
     def set_aside(self) -> Path | None:
         """Make room for a new calibration; what an unfinished one has seen is kept."""

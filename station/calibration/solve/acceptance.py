@@ -156,10 +156,10 @@ def corrected(seen: Sightings, problem: Problem, state: State) -> Track:
     return Track(seen.times_s + state.clock_s[name], transform(state.poses[name], centers))
 
 
-def resting_offsets(problem: Problem, state: State) -> dict[str, Array]:
-    """Mean offset (3,), reference frame, of where each camera sees the resting ball from where the
-    others see it; of cameras that share two places or more."""
-    found: dict[str, list[Array]] = {}
+def resting_offsets(problem: Problem, state: State) -> dict[str, dict[str, Array]]:
+    """Offset (3,), reference frame, of where each camera sees the resting ball from where the
+    others see it, by camera and place."""
+    found: dict[str, dict[str, Array]] = {}
     for place, sightings in problem.resting.items():
         shape = state.place_shapes.get(place, np.zeros(SHAPE))
         at = {}
@@ -173,8 +173,8 @@ def resting_offsets(problem: Problem, state: State) -> dict[str, Array]:
             at[name] = transform(pose, centers).mean(axis=0)
         for name in at if len(at) > 1 else ():
             others = [center for other, center in at.items() if other != name]
-            found.setdefault(name, []).append(at[name] - np.mean(others, axis=0))
-    return {name: np.mean(offs, axis=0) for name, offs in found.items() if len(offs) > 1}
+            found.setdefault(name, {})[place] = at[name] - np.mean(others, axis=0)
+    return found
 
 
 def _typical(away: Array) -> float:

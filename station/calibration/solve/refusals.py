@@ -34,6 +34,8 @@ CONVERGED, DIVERGED = 0.3, 10.0
 can still name the faulty camera."""
 _RESTING_OFF_M = 0.002
 """Mean over the places; .1 to 1.0 mm in sound booths, 4 of a camera that was moved by 5."""
+_ONE_PLACE_OFF_M = 0.006
+"""At one place; up to 2.4 mm in sound booths."""
 _FRONT_M = 0.2
 """Least distance of the ball in front of the mark from it."""
 _MARK_TOLERANCE_M = 0.008
@@ -42,7 +44,7 @@ _SURELY_WRONG = 0.5
 _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
 SIGMAS_95 = 1.96
-_WAVE_AGAIN = "fix it, and wave the ball again from the beginning (station calibrate ball --again)"
+_START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
@@ -124,7 +126,7 @@ def check_pairs(
     check_clocks(clocks.large_jump(tracks, pairs))
     moved = clocks.moved_camera(tracks, pairs)
     if moved is not None:
-        raise CalibrationError(f"camera {moved} was moved while the ball was waved: {_WAVE_AGAIN}")
+        raise CalibrationError(f"camera {moved} was moved while the ball was waved: {_START_AGAIN}")
     for name in detections:
         shares = [float(pair.agree.mean()) for key, pair in pairs.items() if name in key]
         if shares and max(shares) < _AGREEING_SHARE:
@@ -141,7 +143,7 @@ def check_corrected(tracks: Mapping[str, Track]) -> None:
     if moved is not None:
         raise CalibrationError(
             f"camera {moved}, or one that saw the ball with it, was moved while the ball was "
-            f"waved: {_WAVE_AGAIN}"
+            f"waved: {_START_AGAIN}"
         )
 
 
@@ -200,9 +202,9 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         )
 
 
-def remedy(stood: bool) -> str:
-    """Advice against uncertain heights; ``stood``: the ball was on a stand already."""
-    return "wave the ball longer" if stood else f"{STAND_WORDS}, and wave the ball longer"
+def remedy(done: bool, step: str) -> str:
+    """Advice against uncertain heights or girths; ``done``: the step that helps them was done."""
+    return "wave the ball longer" if done else f"{step}, and wave the ball longer"
 
 
 def slope_words(laid: bool) -> str:
@@ -211,12 +213,12 @@ def slope_words(laid: bool) -> str:
 
 
 def check_predicted(
-    predicted: PredictedError, limits: Limits, coverage: Coverage, stood: bool
+    predicted: PredictedError, limits: Limits, coverage: Coverage, stood: bool, boarded: bool
 ) -> None:
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
-    for what, sigma_m, limit_m in (
-        ("heights", predicted.height_sigma_m, limits.height_m),
-        ("girths", predicted.girth_sigma_m, limits.girth_m),
+    for what, sigma_m, limit_m, advice in (
+        ("heights", predicted.height_sigma_m, limits.height_m, remedy(stood, STAND_WORDS)),
+        ("girths", predicted.girth_sigma_m, limits.girth_m, remedy(boarded, BOARD_WORDS)),
     ):
         if not SIGMAS_95 * sigma_m <= limit_m:
             more = "" if coverage.enough else f"; {coverage.advice()}"
@@ -224,7 +226,7 @@ def check_predicted(
                 f"with this calibration, {what} could be wrong by up to "
                 f"{1e3 * SIGMAS_95 * sigma_m:.1f} mm, but the limit is "
                 f"{1e3 * limit_m:.0f} mm (calibrate.{what[:-1]}_limit_m): "
-                f"{remedy(stood)}{more}"
+                f"{advice}{more}"
             )
 
 
@@ -269,14 +271,28 @@ def _other_ball(measured_m: float, radius_m: float) -> CalibrationError:
 
 def check_unmoved(problem: Problem, state: State) -> None:
     """Refuse a camera that was moved between the waving and the steps at which the ball rests."""
-    off_m = {n: float(np.linalg.norm(off)) for n, off in resting_offsets(problem, state).items()}
-    name = max(off_m, key=lambda one: off_m[one], default="")
-    if off_m.get(name, 0.0) > _RESTING_OFF_M:
+    found = resting_offsets(problem, state)
+    means = {
+        name: float(np.linalg.norm(np.mean(list(offs.values()), axis=0)))
+        for name, offs in found.items()
+        if len(offs) > 1
+    }
+    name = max(means, key=lambda one: means[one], default="")
+    if means.get(name, 0.0) > _RESTING_OFF_M:
         raise CalibrationError(
-            f"camera {name} sees the resting ball {1e3 * off_m[name]:.0f} mm away from where the "
-            "others see it, but not the waved one: it, or one beside it, was moved in between; fix "
-            "it, and start again with station calibrate --new"
+            f"camera {name} sees the resting ball {1e3 * means[name]:.0f} mm away from where the "
+            "others see it, but not the waved one: it, or one beside it, was moved in between; "
+            f"{_START_AGAIN}"
         )
+    for name, offs in found.items():
+        for place, off in offs.items():
+            if np.linalg.norm(off) > _ONE_PLACE_OFF_M:
+                raise CalibrationError(
+                    f"at one place ({place}), camera {name} sees the resting ball "
+                    f"{1e3 * float(np.linalg.norm(off)):.0f} mm away from where the others see it: "
+                    "something else was taken for the ball, or a camera was moved; start again "
+                    "with station calibrate --new"
+                )
 
 
 def check_front(places: Mapping[str, Array]) -> None:

@@ -186,7 +186,8 @@ def solve(
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
-        refusals.check_predicted(predicted, limits, coverage, bool(problem.heights_m))
+        stood, boarded = bool(problem.heights_m), _boarded(problem)
+        refusals.check_predicted(predicted, limits, coverage, stood, boarded)
         rig = replace(rig, predicted=predicted)
         weak = _advice(problem, predicted, world_poses, limits, coverage)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
@@ -215,13 +216,20 @@ def _advice(
 ) -> tuple[str, ...]:  # fmt: skip
     """Sentences on what could be better."""
     weak = [] if coverage.enough else [coverage.advice()]
-    if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m or not problem.heights_m:
-        weak.append(f"for heights, {refusals.remedy(bool(problem.heights_m))}")
-    if not any(surface.surface.startswith(WALL) for surface in problem.surfaces):
+    stood = bool(problem.heights_m)
+    if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
+        weak.append(f"for heights, {refusals.remedy(stood, refusals.STAND_WORDS)}")
+    elif not stood:
+        weak.append(f"for heights, {refusals.STAND_WORDS}")
+    if not _boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
         weak.append(f"for the floor's slope, {refusals.slope_words(_laid(problem))}")
     return tuple(weak)
+
+
+def _boarded(problem: Problem) -> bool:
+    return any(surface.surface.startswith(WALL) for surface in problem.surfaces)
 
 
 def _laid(problem: Problem) -> bool:
