@@ -8,14 +8,17 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from station.calibration.detect.detections import BALL, EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, Session
+from station.calibration.guide.store import CalibrationStore
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import VirtualProcedure
+from station.simulation.scene import default_rig
 from station.simulation.sensor import TICK_HZ
 
 STATION = (sys.executable, "-m", "station.cli")
@@ -111,6 +114,24 @@ def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None
     session = Session.load(folder)
     assert session.balls
     assert not session.done(MARK)
+
+
+def test_a_ball_waved_anew_replaces_the_one_in_use(config: Path, recordings: Path) -> None:
+    """The calibration that was solved from it keeps what it saw; it refused the step."""
+    store = CalibrationStore(config.parent / "calibrations", config.parent / "calibration.json")
+    for step in ("floor", "ball"):
+        assert _run(config, recordings, step).returncode == 0
+    seen = len(Session.load(store.unfinished).balls)
+    rig = replace(default_rig(), created="2026-11-01T10:00:00Z")
+    solved = store.use(store.finish(rig, {}).name)
+    done = _run(config, recordings, "ball", "--again")
+    assert done.returncode == 0, done.stderr
+    assert f"added to what calibration {solved.name} was solved from" in done.stdout
+    assert len(Session.load(store.unfinished).balls) == seen
+    assert len(Session.load(solved.folder).balls) == seen
+    store.set_aside()
+    begun = _run(config, recordings, "floor")
+    assert "a new calibration; until it is solved, the other is in use" in begun.stdout
 
 
 def test_a_missing_camera_is_named_and_nothing_is_lost(

@@ -11,7 +11,7 @@ from station.calibration.adjust.problem import State
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import FLOOR, BallDetection, Observations
-from station.calibration.solve import clocks, refusals
+from station.calibration.solve import jumps, refusals
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections, sorted_detections, without_gaps
 from station.calibration.solve.pairwise import Pair, Track
@@ -106,7 +106,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_pairs, tracks(), pairs(0.2)
     ),
     f"the clock of camera {NAMES[1]} jumped by 500 ms": partial(
-        refusals.check_clocks, clocks.ClockJump(NAMES[1], 0.5)
+        refusals.check_clocks, jumps.ClockJump(NAMES[1], 0.5)
     ),
     f"camera {NAMES[1]} saw the ball too rarely together": partial(
         refusals.check_connected, NAMES, {NAMES[0]: np.eye(4)}
@@ -152,7 +152,7 @@ def test_a_refusal_names_its_cause(words: str) -> None:
 
 
 def test_a_camera_that_was_moved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clocks, "moved_camera", lambda *_: NAMES[1])
+    monkeypatch.setattr(jumps, "moved_camera", lambda *_: NAMES[1])
     with pytest.raises(CalibrationError, match=f"camera {NAMES[1]} was moved while"):
         refusals.check_pairs(tracks(), pairs(1.0))
 

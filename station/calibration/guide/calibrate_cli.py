@@ -160,9 +160,7 @@ def ball(procedure: Procedure, again: bool) -> None:
       station calibrate ball
       station calibrate ball --again
     """
-    if again:
-        procedure.session().forget_balls()
-    procedure.ball()
+    procedure.ball(again=again)
     click.echo(_NOT_USED)
 
 

@@ -150,8 +150,8 @@ class Procedure:
         with self._feed(EMPTY) as (feed, session):
             look_at_empty_booth(feed, session, self.guide)
 
-    def ball(self) -> None:
-        """The ball, waved."""
+    def ball(self, *, again: bool = False) -> None:
+        """The ball, waved; ``again``: instead of what was seen of it before."""
         wanted = self.config.calibrate
         self.guide.step(
             "Ball",
@@ -160,8 +160,8 @@ class Procedure:
         )
         with self._feed(BALL) as (feed, session):
             self._remark_on_ghosts(session)
-            if self.recordings is not None and session.balls:
-                # The recording begins anew: what it shows twice was seen once.
+            # A recording begins anew: what it shows twice was seen once.
+            if session.balls and (again or self.recordings is not None):
                 session.forget_balls()
             reference, lasts_s = self.config.reference, wanted.waving_s
             wave_ball(feed, session, self.guide, reference=reference, lasts_s=lasts_s)
@@ -330,6 +330,8 @@ class Procedure:
                 session = Session.begin(
                     self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras
                 )
+                if self.store.in_use.exists():
+                    self.guide.say("a new calibration; until it is solved, the other is in use")
             else:
                 session.check_cameras(cameras)
                 session.check_radius(self.config.calibrate.ball_radius_m)

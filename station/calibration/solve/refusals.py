@@ -12,7 +12,7 @@ from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import FRONT, MARK, BallDetection, Observations
-from station.calibration.solve import clocks
+from station.calibration.solve import jumps
 from station.calibration.solve.acceptance import HeldOut, resting_offsets
 from station.calibration.solve.initial import Detections
 from station.calibration.solve.pairwise import Pair, Track
@@ -123,8 +123,8 @@ def check_pairs(
             "no two cameras saw the ball at one time: wave it where several of them see it"
         )
     tracks = {name: own.track for name, own in detections.items()}
-    check_clocks(clocks.large_jump(tracks, pairs))
-    moved = clocks.moved_camera(tracks, pairs)
+    check_clocks(jumps.large_jump(tracks, pairs))
+    moved = jumps.moved_camera(tracks, pairs)
     if moved is not None:
         raise CalibrationError(f"camera {moved} was moved while the ball was waved: {_START_AGAIN}")
     for name in detections:
@@ -138,8 +138,8 @@ def check_pairs(
 
 def check_corrected(tracks: Mapping[str, Track]) -> None:
     """Refuse what only corrected tracks show: a clock that slips, a camera that was bumped."""
-    check_clocks(clocks.small_jump(tracks))
-    moved = clocks.slightly_moved_camera(tracks)
+    check_clocks(jumps.small_jump(tracks))
+    moved = jumps.slightly_moved_camera(tracks)
     if moved is not None:
         raise CalibrationError(
             f"camera {moved}, or one that saw the ball with it, was moved while the ball was "
@@ -147,7 +147,7 @@ def check_corrected(tracks: Mapping[str, Track]) -> None:
         )
 
 
-def check_clocks(jump: clocks.ClockJump | None) -> None:
+def check_clocks(jump: jumps.ClockJump | None) -> None:
     if jump is not None:
         raise CalibrationError(
             f"the clock of camera {jump.camera} jumped by {1e3 * jump.jump_s:.0f} ms midway (its "

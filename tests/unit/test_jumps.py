@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from station.calibration.solve.clocks import large_jump
+from station.calibration.solve.jumps import large_jump
 from station.calibration.solve.pairwise import Track, estimate_pairs
 
 
