@@ -220,8 +220,10 @@ def test_what_was_seen_survives_its_file(camera: CameraCalibration) -> None:
     for broken in ({}, {**seen.to_json(), "center_m": [1, 2]}, {**seen.to_json(), "patches": 3}):
         with pytest.raises(FormatError, match="ball detection"):
             BallDetection.from_json(broken)
-    with pytest.raises(FormatError, match="surface"):
-        PlaneObservation.from_json({"camera": "a"})
+    few = {**plane.to_json(), "patches": plane.to_json()["patches"][:2]}
+    for broken, told in (({"camera": "a"}, "'patches'"), (few, "3 patches are needed, not 2")):
+        with pytest.raises(FormatError, match=told):
+            PlaneObservation.from_json(broken)
 
 
 def test_drawn_balls_are_what_ray_casting_sees() -> None:
