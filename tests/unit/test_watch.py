@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.scene import static_view
-from station.calibration.drift.motion import CameraMove
+from station.calibration.drift.motion import QUIET_M, CameraMove
 from station.calibration.drift.watch import Doubts, DriftWatch
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
@@ -113,8 +113,8 @@ def test_without_a_stored_scene_there_is_nothing_to_check(store: CalibrationStor
 
 def _estimate(size: float, camera: str = "a") -> CameraMove:
     """Estimate of a camera's move forward that is ``size`` times what alarms."""
-    sigma_m = 1e-3
-    xi = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0 * sigma_m * size])
+    sigma_m = 4e-4
+    xi = np.array([0.0, 0.0, 0.0, 0.0, 0.0, QUIET_M + 2.0 * sigma_m * size])
     return CameraMove(camera, xi, sigma_m**2 * np.diag([1e-4] * 3 + [1.0] * 3), 1.0)
 
 
@@ -127,6 +127,15 @@ def test_a_slight_alarm_waits_for_the_next_scan() -> None:
     assert not doubts.confirmed(_estimate(1.2, "b"))
     assert doubts.confirmed(_estimate(1.3))
     assert doubts.confirmed(_estimate(1.1))
+
+
+@pytest.mark.parametrize(("slid_m", "moved"), [(0.037, False), (0.08, True)])
+def test_unseen_directions_alarm_late(slid_m: float, moved: bool) -> None:
+    """Edges on a bare wall that lost pixels were taken for a camera that slid along it by 37 mm."""
+    variances = np.array([1e-4, 1e-4, 1e-4, 5.0, 1.0, 1.0]) ** 2 * np.array([1.0] * 3 + [1e-6] * 3)
+    slid = CameraMove("a", np.array([0.0, 0.0, 0.0, slid_m, 0.0, 0.0]), np.diag(variances), 1.0)
+    assert slid.moved == moved
+    assert any("sideways" in words for words in slid.unseen_words())
 
 
 def test_a_clear_alarm_does_not_wait() -> None:

@@ -32,6 +32,9 @@ _CERTAINTY = 2.0
 _NOT_STILL = 5.0
 """... if it is also so far from none at all: of a camera that stands still, in the three directions
 in which errors may exceed the tolerance, once in 60,000 views, if errors are as stated."""
+_HARDLY_SHOWN_M, _HARDLY_SHOWN_TIMES = 0.003, 2.0
+"""Directions that are known worse than this may be wrong by so many times what is stated: the
+little that shows them, edges mostly, errs alike in all scans."""
 _AT_ONCE = 1.5
 """An alarm so many times what alarms needs no second scan."""
 _AGREE = 16.8
@@ -99,8 +102,13 @@ class CameraMove:
     def alarm(self) -> float:
         """Distance from no move, and from the nearest within the tolerance, as a share of what
         alarms."""
-        from_still = float(np.sqrt(self.xi @ np.linalg.solve(self.covariance, self.xi)))
-        return min(self.beyond() / _CERTAINTY, from_still / _NOT_STILL)
+        size = self.xi * _SCALE
+        variances, directions = np.linalg.eigh(self.covariance * np.outer(_SCALE, _SCALE))
+        hardly_shown = variances > _HARDLY_SHOWN_M**2
+        variances = variances * np.where(hardly_shown, _HARDLY_SHOWN_TIMES**2, 1.0)
+        information = np.asarray(directions / variances @ directions.T)
+        from_still = float(np.sqrt(size @ information @ size))
+        return min(_beyond_tolerance(size, information) / _CERTAINTY, from_still / _NOT_STILL)
 
     def beyond(self) -> float:
         """Standard deviations from the nearest move within the tolerance."""

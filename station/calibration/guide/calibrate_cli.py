@@ -133,7 +133,8 @@ def _list(procedure: Procedure) -> None:
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms{accuracy}"
         )
     if session is not None:
-        click.echo(f"  unfinished, started {session.started}: {session.summary()}")
+        origin = f", added to {session.adds_to}" if session.adds_to else ""
+        click.echo(f"  unfinished, started {session.started}{origin}: {session.summary()}")
 
 
 @calibrate.command("floor")
