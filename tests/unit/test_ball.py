@@ -221,7 +221,7 @@ def test_what_was_seen_survives_its_file(camera: CameraCalibration) -> None:
         with pytest.raises(FormatError, match="ball detection"):
             BallDetection.from_json(broken)
     few = {**plane.to_json(), "patches": plane.to_json()["patches"][:2]}
-    for broken, told in (({"camera": "a"}, "'patches'"), (few, "3 patches are needed, not 2")):
+    for broken, told in (({"camera": "a"}, "surface"), (few, "3 patches are needed, not 2")):
         with pytest.raises(FormatError, match=told):
             PlaneObservation.from_json(broken)
 

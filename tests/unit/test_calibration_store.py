@@ -263,7 +263,7 @@ def test_the_calibration_in_use_is_taken_up_again_for_further_steps(
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ({"step": "wall-0", "planes": [{"camera": "front-lower"}]}, "patches"),
+        ({"step": "wall-0", "planes": [{"camera": "front-lower"}]}, "surface"),
         ({"step": "wall-0", "planes": [{"camera": "front-lower", "surface": "wall-0",
           "points": 9, "patches": np.zeros((0, 4)).tolist()}]}, "numbers were expected"),
         ({"step": "wall-0", "planes": [{"camera": "front-lower", "surface": "wall-0",

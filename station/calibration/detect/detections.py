@@ -152,15 +152,15 @@ class PlaneObservation:
             FormatError: a field is missing or is not what it should be.
         """
         try:
-            patches = _numbers(document["patches"], (None, 4))
-            if len(patches) < _FEWEST_PATCHES:
-                raise ValueError(f"{_FEWEST_PATCHES} patches are needed, not {len(patches)}")
-            return cls(
+            seen = cls(
                 camera=str(document["camera"]),
                 surface=str(document["surface"]),
                 points=int(document["points"]),
-                patches=patches,
+                patches=_numbers(document["patches"], (None, 4)),
             )
+            if len(seen.patches) < _FEWEST_PATCHES:
+                raise ValueError(f"{_FEWEST_PATCHES} patches are needed, not {len(seen.patches)}")
+            return seen
         except (KeyError, TypeError, ValueError) as cause:
             raise FormatError(f"a plane observation cannot be read ({cause})") from None
 

@@ -103,7 +103,7 @@ class CameraMove:
         """Distance from no move, and from the nearest within the tolerance, as a share of what
         alarms."""
         size = self.xi * _SCALE
-        variances, directions = np.linalg.eigh(self.covariance * np.outer(_SCALE, _SCALE))
+        variances, directions = np.linalg.eigh(_in_metres(self.covariance))
         hardly_shown = variances > _HARDLY_SHOWN_M**2
         variances = variances * np.where(hardly_shown, _HARDLY_SHOWN_TIMES**2, 1.0)
         information = np.asarray(directions / variances @ directions.T)
@@ -112,7 +112,7 @@ class CameraMove:
 
     def beyond(self) -> float:
         """Standard deviations from the nearest move within the tolerance."""
-        information = np.asarray(np.linalg.inv(self.covariance * np.outer(_SCALE, _SCALE)))
+        information = np.asarray(np.linalg.inv(_in_metres(self.covariance)))
         return _beyond_tolerance(self.xi * _SCALE, information)
 
     def unseen(self) -> list[Array]:
@@ -122,7 +122,7 @@ class CameraMove:
         Rotation vector times LEVER_M and translation, camera frame. A shift is also unseen if a
         turn within the tolerance would look like it, and the other way round.
         """
-        information = np.linalg.inv(self.covariance * np.outer(_SCALE, _SCALE))
+        information = np.linalg.inv(_in_metres(self.covariance))
         turns, shifts = slice(0, 3), slice(3, 6)
         found = []
         for mine, other, quiet, other_quiet in (
@@ -155,7 +155,7 @@ class CameraMove:
 
     def known(self) -> Array:
         """The move (6,) without the components that this view does not determine."""
-        variances, directions = np.linalg.eigh(self.stated * np.outer(_SCALE, _SCALE))
+        variances, directions = np.linalg.eigh(_in_metres(self.stated))
         told = np.sqrt(np.maximum(variances, 0.0)) < _TOLD_SIGMA_M
         size = np.where(told, directions.T @ (self.xi * _SCALE), 0.0)
         return np.asarray(directions @ size / _SCALE)
@@ -163,6 +163,11 @@ class CameraMove:
     def unseen_words(self) -> list[str]:
         """The directions of ``unseen`` in plain words."""
         return [_direction_words(direction) for direction in self.unseen()]
+
+
+def _in_metres(covariance: Array) -> Array:
+    """A covariance (6, 6) of rotations times LEVER_M and shifts, m^2."""
+    return np.asarray(covariance * np.outer(_SCALE, _SCALE))
 
 
 def move_words(xi: Array) -> str:
