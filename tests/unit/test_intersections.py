@@ -85,6 +85,11 @@ def test_asking_for_some_triangles_finds_all_their_pairs(model: BodyModel) -> No
     assert {tuple(pair) for pair in crossing_pairs(body, model.faces, asking).tolist()} == wanted
 
 
+def test_no_pair_crosses_where_no_triangle_is_tested(model: BodyModel) -> None:
+    nothing = np.zeros(len(model.faces), bool)
+    assert crossing_pairs(model.mean, model.faces, nothing).shape == (0, 2)
+
+
 def _nothing(model: BodyModel) -> NDArray[np.bool_]:
     """No vertex is measured."""
     return np.zeros(model.vertex_count, bool)

@@ -38,6 +38,8 @@ def crossing_pairs(
     else:
         # Triangles far from all tested ones need not be compared.
         near = np.flatnonzero(_near(lows, highs, tested, _CELL_M))
+    if len(near) == 0:
+        return np.empty((0, 2), np.int32)
     upwards = near[np.argsort(lows[near, 2], kind="stable")]
     found = _crossing_pairs(
         corners[upwards], lows[upwards], highs[upwards], faces[upwards], tested[upwards]
