@@ -28,13 +28,14 @@ def floor_rows(model: BodyModel, skin: Skin, tolerance_m: float) -> Rows:
     """Rows that place the soles on z = 0, and lift whatever lies below the floor.
 
     Args:
-        tolerance_m: a foot whose lowest point is farther than this from the floor gets no rows.
+        tolerance_m: a foot whose lowest point is farther than this from the floor gets no rows, nor
+            does one that is clearly lifted.
     """
     height = skin.positions[:, 2]
     touching = height < 0.0
     for foot in _feet(model, skin.part):
         low = float(height[foot].min())
-        if abs(low) < tolerance_m:
+        if abs(low) < min(tolerance_m, _LIFTED_M):
             touching |= foot & (height < low + _SOLE_BAND_M) & (skin.normals[:, 2] < _FACING_DOWN)
     found = np.flatnonzero(touching)
     return Rows(
