@@ -309,6 +309,16 @@ def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
         trace_all(model, torn)
 
 
+def test_a_landmark_far_astray_blanks_its_own_rows_alone(model: BodyModel) -> None:
+    """One knee in a torn cloud ended the whole result."""
+    spiked = model.mean.copy()
+    spiked[model.landmarks["knee_left"], 2] = 3.0
+    document = measurements_document(Origin("s1"), measure_body(model, spiked))
+    blank = {row["name"] for row in document["measurements"] if row["value_m"] is None}
+    assert blank == {"knee_girth_left"}
+    assert "knee_girth" not in {row["name"] for row in document["differences"]}
+
+
 @pytest.mark.parametrize("bow_deg", range(0, 60, 5))
 def test_a_chin_on_the_chest_blanks_the_neck_alone(model: BodyModel, bow_deg: int) -> None:
     """Around shoulders and chin together, a neck of 53 cm was measured as 91."""

@@ -75,7 +75,7 @@ def measure_body(
         scan_errors: what concerns the whole scan.
 
     Raises:
-        InputError: a place is not a number, or a plane misses the part that it should cut.
+        InputError: a place is not a number, or many planes miss the part that they should cut.
     """
     return _measured(
         model, vertices, vertices, "as-scanned", vertex_sigma_m, vertex_seen, scan_errors

@@ -49,6 +49,8 @@ _CLEARANCE_M = 0.02
 """Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
 _MIN_LOOP = 8
 """Points of a section from which a piece may be a loop of skin."""
+_BROKEN_SHARE = 0.1
+"""Share of rows whose planes miss what they should cut, beyond which the mesh is no body."""
 
 
 class NoLineError(ValueError):
@@ -84,12 +86,15 @@ def trace_all(
     """The rows of a table on a body (P, 3), z up, floor at 0.
 
     Raises:
-        InputError: a place is not a number, or a plane misses the part that it should cut.
+        InputError: a place is not a number, or many planes miss the part that they should cut.
     """
     if not np.isfinite(vertices).all():
         raise InputError("the mesh holds values that are not numbers; fit the body again")
     tracer = _Tracer(model, vertices)
-    return [tracer.trace(definition) for definition in definitions]
+    traces = [tracer.trace(definition) for definition in definitions]
+    if len(tracer.missed) > _BROKEN_SHARE * len(definitions):
+        raise InputError(f"{tracer.missed[0]}; fit the body again")
+    return traces
 
 
 @lru_cache(maxsize=64)
@@ -123,17 +128,17 @@ class _Tracer:
         self._middles = corners.mean(axis=1)
         self._crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._cuts: dict[Section, _Tape] = {}
+        self.missed: list[str] = []
+        """Rows whose planes missed what they should cut, and why."""
 
     def trace(self, definition: Definition) -> Trace:
         try:
             value, points, closed, to_floor = self._follow(definition)
-        except NoLineError:
+        except ValueError as cause:
+            if not isinstance(cause, NoLineError):
+                self.missed.append(f"{definition.name} cannot be measured: {cause}")
             marks = [self._model.landmarks[name] for name in definition.landmarks]
             return Trace(definition, math.nan, EdgePoints.at(marks), False, False)
-        except ValueError as cause:
-            raise InputError(
-                f"{definition.name} cannot be measured: {cause}; fit the body again"
-            ) from None
         return Trace(definition, value, points, closed, to_floor)
 
     def _follow(self, definition: Definition) -> tuple[float, EdgePoints, bool, bool]:
