@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
 
 
-_NOT_USED = "  kept, and not in use yet: station calibrate solve puts it into use"
 _INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended, as in a shell."""
 
@@ -82,6 +81,18 @@ def _called(
     return result
 
 
+def _step(command: Callable[..., None]) -> Callable[..., Any]:
+    """A step by itself: what it saw is kept until `solve`."""
+
+    @_options
+    @functools.wraps(command)
+    def wrapped(procedure: Procedure, **kwargs: Any) -> None:
+        command(procedure, **kwargs)
+        click.echo("  kept, and not in use yet: station calibrate solve puts it into use")
+
+    return wrapped
+
+
 @click.group(invoke_without_command=True)
 @click.option("--use", "use_name", metavar="DATE", help="put a stored calibration into use")
 @click.option("--list", "list_them", is_flag=True, help="show the stored calibrations")
@@ -138,7 +149,7 @@ def _list(procedure: Procedure) -> None:
 
 
 @calibrate.command("floor")
-@_options
+@_step
 def floor(procedure: Procedure) -> None:
     """Look at the empty booth: its floor, and what always stands there.
 
@@ -147,12 +158,11 @@ def floor(procedure: Procedure) -> None:
       station calibrate floor
     """
     procedure.empty()
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("ball")
 @click.option("--again", is_flag=True, help="discard the earlier recordings of the ball")
-@_options
+@_step
 def ball(procedure: Procedure, again: bool) -> None:
     """Wave the ball; what is seen is added to what was seen before.
 
@@ -162,12 +172,11 @@ def ball(procedure: Procedure, again: bool) -> None:
       station calibrate ball --again
     """
     procedure.ball(again=again)
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("mark")
 @click.option("--front", is_flag=True, help="in front of the mark: says where the person faces")
-@_options
+@_step
 def mark(procedure: Procedure, front: bool) -> None:
     """Look at the ball lying on the mark: the origin of all measurements.
 
@@ -179,11 +188,10 @@ def mark(procedure: Procedure, front: bool) -> None:
     from station.calibration.detect.detections import FRONT, MARK
 
     procedure.rest(FRONT if front else MARK)
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("around")
-@_options
+@_step
 def around(procedure: Procedure) -> None:
     """Look at the ball lying on the floor beside and behind the mark: the floor's slope.
 
@@ -194,7 +202,6 @@ def around(procedure: Procedure) -> None:
       station calibrate around
     """
     procedure.around(asked=False)
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("stand")
@@ -205,7 +212,7 @@ def around(procedure: Procedure) -> None:
     required=True,
     help="of the ball's underside above the floor, metres, measured to 1 mm",
 )
-@_options
+@_step
 def stand(procedure: Procedure, height_m: float) -> None:
     """Look at the ball on a stand of measured height on the mark: the scale of all heights.
 
@@ -218,11 +225,10 @@ def stand(procedure: Procedure, height_m: float) -> None:
       station calibrate stand --height 1.7
     """
     procedure.stand(height_m)
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("depth")
-@_options
+@_step
 def depth(procedure: Procedure) -> None:
     """Look at a flat board at three distances or more: each sensor's own depth error.
 
@@ -231,7 +237,6 @@ def depth(procedure: Procedure) -> None:
       station calibrate depth
     """
     procedure.walls(asked=False)
-    click.echo(_NOT_USED)
 
 
 @calibrate.command("solve")
