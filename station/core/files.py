@@ -210,7 +210,10 @@ def read_json(
     version = document.get("version")
     if not isinstance(version, int) or isinstance(version, bool) or version not in versions:
         readable = ", ".join(str(known) for known in sorted(versions))
-        raise error(f"{path} has {format} version {version!r}; this program reads {readable}")
+        raise error(
+            f"{path} has {format} version {version!r}; this program reads {readable}; "
+            "read it with the version that wrote it"
+        )
     return dict(document)
 
 
