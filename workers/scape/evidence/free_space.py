@@ -26,6 +26,8 @@ _MARGIN_PX = 1.5
 """Flicker of the outline, which does not count."""
 _DEEPEST_PX = 40.0
 """Distance from the outline beyond which a vertex is not moved: the limb is elsewhere."""
+_SEEN_THROUGH_PX = 6.0
+"""Depth in the background from which a vertex is not there: outlines of coarse fits lie nearer."""
 _MIN_SLOPE = 1e-6
 
 
@@ -79,6 +81,15 @@ class FreeSpace:
             np.concatenate([one.depth_m for one in found]),
         )
 
+    def seen_through(self, poses: Sequence[Array], vertices: Array) -> NDArray[np.bool_]:
+        """Mask of the vertices (P, 3) where a camera saw the booth behind them, however deep in the
+        background."""
+        found = np.zeros(len(vertices), bool)
+        for view, pose in zip(self.views, poses, strict=True):
+            vertex, _, deep, _ = _before_background(view, pose, vertices)
+            found[vertex[deep > _SEEN_THROUGH_PX]] = True
+        return found
+
 
 def _view(view: CameraView) -> _View:
     inside = cv2.distanceTransform(view.background.astype(np.uint8), cv2.DIST_L2, 3)
@@ -91,7 +102,11 @@ def _view(view: CameraView) -> _View:
     )
 
 
-def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
+def _before_background(
+    view: _View, pose: Array, vertices: Array
+) -> tuple[NDArray[np.intp], NDArray[np.int64], Image, Array]:
+    """Vertices (n,) well before the booth that a pixel shows: their pixels (n, 2), the pixels'
+    distances (n,) from all that is not background, and the vertices' depths (n,)."""
     camera = view.camera.calibration
     local = transform(invert(pose), vertices)
     pixels = np.rint(np.nan_to_num(project(camera, local), nan=-1.0)).astype(np.int64)
@@ -99,15 +114,20 @@ def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
     inside = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
     vertex = np.flatnonzero(inside)
     u, v = pixels[vertex].T
-    deep = view.inside_px[v, u]
     behind = view.camera.depth_m[v, u] - local[vertex, 2] > _BEHIND_M
-    wrong = behind & (deep > _MARGIN_PX) & (deep < _DEEPEST_PX)
-    vertex, u, v, deep = vertex[wrong], u[wrong], v[wrong], deep[wrong]
+    vertex = vertex[behind]
+    return vertex, pixels[vertex], view.inside_px[v, u][behind], local[vertex, 2]
+
+
+def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
+    vertex, pixels, deep, depth_m = _before_background(view, pose, vertices)
+    wrong = (deep > _MARGIN_PX) & (deep < _DEEPEST_PX)
+    vertex, (u, v), deep, depth_m = vertex[wrong], pixels[wrong].T, deep[wrong], depth_m[wrong]
     slope = np.stack([view.slope[0][v, u], view.slope[1][v, u]], axis=1).astype(np.float64)
     slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), _MIN_SLOPE)
     axes = pose[:3, :2]
     return Intrusions(
         vertex,
         slope @ axes.T,
-        (deep - _MARGIN_PX) * local[vertex, 2] / camera.K[0, 0],
+        (deep - _MARGIN_PX) * depth_m / view.camera.calibration.K[0, 0],
     )

@@ -278,16 +278,24 @@ def _best_start(
     progress: Progress,
     observer: Observer,
 ) -> JointResult:
-    """Fit from the best start, and from others as long as too many points stay unexplained."""
+    """Fit from the best start, and from others as long as too many points stay unexplained.
+
+    Of starts that leave points unexplained, the best has the least sum of their share and the share
+    of skin that cameras saw through: a body with its arms up explains one whose arm was not seen.
+    """
     best, least, first = None, np.inf, starts[0]
     cameras = CameraCorrections.build(cloud, views)
     for start in starts[:_MAX_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
         left = unexplained_share(model, coarse.vertices, cloud)
-        if left < least:
-            best, least, first = coarse, left, start
-        if least < _EXPLAINED:
+        if left < _EXPLAINED:
+            best, first = coarse, start
             break
+        poses = coarse.cameras.poses(views)
+        absent = target.free_space.seen_through(poses, coarse.vertices)
+        wrong = left + float(absent @ model.vertex_shares) / len(absent)
+        if wrong < least:
+            best, least, first = coarse, wrong, start
     assert best is not None
     if is_head_hidden(model, best.vertices, cloud.points):
         start = taller(model, first)
