@@ -19,7 +19,7 @@ from station.simulation.scene import (
 )
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
-from workers.scape.evidence.crown import crown_rows, crown_sigma_m
+from workers.scape.evidence.crown import _outline, crown_rows, crown_sigma_m
 from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
@@ -209,3 +209,12 @@ def test_a_scanner_that_sees_the_top_of_a_head_adds_little(
     low = body[body[:, 2] < 1.2]
     assert crown_sigma_m(model, [], [], body, low, nothing) == pytest.approx(0.03)
     assert crown_sigma_m(model, [], [], body, low, face) == pytest.approx(0.011)
+
+
+def test_a_column_between_head_and_ear_has_no_outline() -> None:
+    """A scan of a head that leant far ended in an error."""
+    places = np.array([[10.0, 50.0], [19.5, 50.0], [20.5, 50.0], [30.0, 50.0]])
+    columns, rows, _ = _outline(places, np.array([[0, 1], [2, 3]]), 640)
+    assert {19, 21} <= set(columns)
+    assert 20 not in columns
+    assert np.isfinite(rows).all()
