@@ -48,7 +48,7 @@ COARSE = (
 )
 MIDDLE = tuple(
     AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.05, np.radians(45), 0.010, 0.06)
-    for _ in range(2)
+    for _ in range(3)
 )
 FINE = tuple(
     AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2) for _ in range(3)
