@@ -35,7 +35,7 @@ in which errors may exceed the tolerance, once in 60,000 views, if errors are as
 _HARDLY_SHOWN_M, _HARDLY_SHOWN_TIMES = 0.003, 2.0
 """Directions that are known worse than this may be wrong by so many times what is stated: the
 little that shows them, edges mostly, errs alike in all scans."""
-_AT_ONCE = 2.0
+_AT_ONCE = 1.5
 """An alarm so many times what alarms needs no second scan."""
 _AGREE = 16.8
 """Squared distance of two estimates of one move, in units of their covariances, that one pair in
