@@ -164,6 +164,18 @@ def test_measured_skin_stays_while_the_rest_can_give_way(model: BodyModel) -> No
     assert np.count_nonzero(left) < 0.2 * np.count_nonzero(before)
 
 
+def test_measured_skin_never_moves_far(model: BodyModel) -> None:
+    """Fingers that close into the palm, all of them measured: parting them took 25 mm, so they
+    stay."""
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("fingers_left"), 2] = np.radians(60.0)
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    body = model.vertices(state)
+    assert self_intersections(body, model.faces) > 0
+    free = untangled(model, body, body, ~_nothing(model))
+    assert np.linalg.norm(free - body, axis=1).max() < 0.011
+
+
 def _near(model: BodyModel, vertices: NDArray[np.int32], rings: int) -> NDArray[np.bool_]:
     near = _nothing(model)
     near[vertices] = True

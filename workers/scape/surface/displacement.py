@@ -7,9 +7,9 @@ The skin is the model's surface Y plus an offset d, which minimises
 with p_i the points, n_i their normals, w_i their information and x_i the nearest place on the
 current surface; c runs over the coordinates, and Q is the precision of a Matern field
 (`offset_prior`). The field's standard deviation follows from this scan: how far its points lie from
-the model's surface. The whole offset is penalised, not the step of a round, so that what no camera
-saw goes back to the model with the distance from what one did. Rounds narrow the gate and weaken
-the prior.
+the model's surface, in hands and feet apart from the rest. The whole offset is penalised, not the
+step of a round, so that what no camera saw goes back to the model with the distance from what one
+did. Rounds narrow the gate and weaken the prior.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from workers.cloud.observed import PointCloud
 from workers.scape.evidence.correspondence import TrackedPoints
 from workers.scape.evidence.floor import stand_on_floor
 from workers.scape.evidence.rows import Rows
-from workers.scape.model.body_model import BodyModel
+from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import Attachments, attached
 from workers.scape.surface.offset_equations import OffsetRows, solved
@@ -61,6 +61,11 @@ _REACH_M = 0.030
 _SIGMA_PER_MISMATCH = 3.5
 """Standard deviation of the offsets per mismatch of the points and the model's surface, without the
 points' noise. More than 1, since folds and edges are steeper than a field of one range."""
+_LOCAL_FROM_M = 0.008
+"""Standard deviation from which that of a hand or foot by its own mismatch, which grows with the
+square, counts: those of the model's family have 3 to 6 mm, fists of another 20."""
+_SCAN_SHARE = 0.05
+"""Share of the whole scan's mismatch in a vertex's own, for those with few points around."""
 _NOISE_LEFT = 0.8
 """Standard deviation of the mean of a vertex's points per that of a point: they share most."""
 _MIN_SIGMA_M = 0.0008
@@ -205,14 +210,40 @@ def fit_surface(
         away = readings.away_m(used, places.of(vertices, model.faces))
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
-            mismatch_square = before.rms_m**2 - (_NOISE_LEFT * readings.noise_m) ** 2
-            sigma_m = max(_SIGMA_PER_MISMATCH * np.sqrt(max(mismatch_square, 0.0)), _MIN_SIGMA_M)
+            sigma_m = _offset_sigma_m(model, before, readings.noise_m)
         rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
         rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
         of_round_m = sigma_m / np.sqrt(round_.stiffness)
         offset = solved(model, prior, of_round_m, rows, offset, round_.enough)
     assert before is not None
     return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
+
+
+def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Array:
+    """(P,): standard deviation of the offsets in the prior.
+
+    Hands and feet that the model follows far worse than the rest have one of their own.
+
+    Args:
+        before: what the cloud says before the surface is displaced.
+        noise_m: rms of the standard deviations of the cloud's points.
+    """
+    prior, observed = offset_prior(model), before.observed.astype(np.float64)
+    of_noise = (_NOISE_LEFT * noise_m) ** 2
+    total = prior.share_around(observed * before.residual_m**2) + _SCAN_SHARE * before.rms_m**2
+    around = total / (prior.share_around(observed) + _SCAN_SHARE)
+    whole, local = (
+        np.maximum(_SIGMA_PER_MISMATCH * np.sqrt(np.maximum(square - of_noise, 0.0)), _MIN_SIGMA_M)
+        for square in (before.rms_m**2, around)
+    )
+    return np.where(_of_ends(model), np.maximum(whole, local**2 / _LOCAL_FROM_M), whole)
+
+
+@lru_cache(maxsize=2)
+def _of_ends(model: BodyModel) -> NDArray[np.bool_]:
+    """Mask (P,) of hands and feet."""
+    ends = [name.rpartition("_")[0] in (*HAND, "foot") for name in model.part_names]
+    return np.array(ends)[model.part_of_vertex]
 
 
 def _examined(

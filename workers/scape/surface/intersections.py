@@ -41,6 +41,8 @@ _SWEEPS = 8
 """Times that offsets are replaced by their neighbours' mean in one round."""
 _DEEPEST_M = 0.030
 """Depth to which flesh yields: limbs that are deeper inside each other are left alone."""
+_MEASURED_YIELDS_M = 0.010
+"""Farthest motion of measured skin: a contact that takes more, as of fingers in a fist, stays."""
 _FLATTENING = 0.75
 """Share of the way to the neighbours' mean that a flattened vertex moves in one round."""
 
@@ -104,7 +106,8 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
         tested = np.asarray(changed[faces].any(axis=1))
     else:
         bad = _bad(current, reference, faces, tested)
-    spoiled = np.linalg.norm(current - first, axis=1) > _DEEPEST_M
+    farthest_m = np.where(measured, _MEASURED_YIELDS_M, _DEEPEST_M)
+    spoiled = np.linalg.norm(current - first, axis=1) > farthest_m
     spoiled[faces[bad | given_up]] = True
     return _restored(current, first, np.flatnonzero(spoiled), mean)
 

@@ -73,7 +73,7 @@ class _Pattern:
 def solved(
     model: BodyModel,
     prior: OffsetPrior,
-    sigma_m: float,
+    sigma_m: Array,
     rows: OffsetRows,
     start: Array,
     enough: float,
@@ -84,7 +84,7 @@ def solved(
     diagonal: where there are data they settle in a few steps.
 
     Args:
-        sigma_m: standard deviation of the offsets in the prior.
+        sigma_m: (P,), standard deviation of the offsets in the prior.
         start: (P, 3), offsets to start from.
         enough: squared residual, in the preconditioner's norm, at which to stop: about the energy
             that is still to be gained. An energy and no share of one, since the share would solve

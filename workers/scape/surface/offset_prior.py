@@ -63,8 +63,8 @@ class OffsetPrior:
         return cls(operator, area, _edge_lengths(vertices, faces), smoother)
 
     @staticmethod
-    def tau_square(sigma_m: float) -> float:
-        """tau^2 of a field with a standard deviation."""
+    def tau_square(sigma_m: Array) -> Array:
+        """(P,): tau^2 of a field with a standard deviation (P,) at each vertex."""
         return 1.0 / (4.0 * np.pi * _KAPPA**2 * sigma_m**2)
 
     def share_around(self, values: Array) -> Array:
