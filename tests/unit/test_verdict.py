@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
+from workers.scape.evidence.inside import share_inside
 from workers.scape.fit.posture import arms_inside, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
 from workers.scape.fit.verdict import PartReport, judge, lost_parts
@@ -82,6 +83,22 @@ def test_an_arm_that_the_fit_put_into_the_trunk_is_named(model: BodyModel) -> No
         assert "forearm was not found" in verdict.reasons[0]
         parts = ("upper_arm", "forearm", "hand")
         assert set(verdict.missing) == {f"{part}_{side}" for part in parts for side in arms}
+
+
+def test_a_hand_alone_in_the_trunk_is_an_arm_that_was_not_found(model: BodyModel) -> None:
+    """A forearm in a dark sleeve was bent to the trunk, a quarter of it inside: the scan was ok,
+    and the forearm 22 cm off."""
+    twists = np.zeros((model.part_count, 3))
+    twists[model.part_names.index("forearm_right")] = (0.0, 0.0, np.radians(90.0))
+    state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
+    vertices = model.vertices(state)
+    assert share_inside(model, vertices, ["forearm_right"]) < 0.3
+    verdict = _verdict(model, {"": "80 cm2 of the scan"}, {}, arms_inside(model, vertices))
+    # What lies beside the body may be the arm itself.
+    assert verdict.reasons == (
+        "the right forearm was not found: hold both arms away from the body",
+    )
+    assert {"forearm_right", "hand_right"} <= set(verdict.missing)
 
 
 def _rotations(model: BodyModel, part: str, twist: tuple[float, float, float]) -> Array:

@@ -17,8 +17,8 @@ _DEEP_M = 0.004
 _AROUND = ("pelvis", "abdomen", "chest", "neck", "head", "thigh_left", "thigh_right")
 
 
-def shares_inside(model: BodyModel, vertices: Array, parts: Sequence[str]) -> dict[str, float]:
-    """Shares of parts' vertices that lie 4 mm or more below the skin of trunk, head and thighs.
+def share_inside(model: BodyModel, vertices: Array, parts: Sequence[str]) -> float:
+    """Share of some parts' vertices that lie 4 mm or more below the skin of trunk, head and thighs.
 
     Args:
         vertices: (P, 3), metres, before crossings are mended.
@@ -26,11 +26,7 @@ def shares_inside(model: BodyModel, vertices: Array, parts: Sequence[str]) -> di
     names = np.array(model.part_names)[model.part_of_vertex]
     around = np.isin(names, _AROUND)
     skin, normals = vertices[around], vertex_normals(vertices, model.faces)[around]
-    tree = cKDTree(skin)
-    shares = {}
-    for part in parts:
-        places = vertices[names == part]
-        nearest = tree.query(places)[1]
-        depth = -np.einsum("ij,ij->i", places - skin[nearest], normals[nearest])
-        shares[part] = float(np.mean(depth > _DEEP_M))
-    return shares
+    places = vertices[np.isin(names, parts)]
+    nearest = cKDTree(skin).query(places)[1]
+    depth = -np.einsum("ij,ij->i", places - skin[nearest], normals[nearest])
+    return float(np.mean(depth > _DEEP_M))

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from station.core.geometry import so3_log
 from workers.cloud.observed import Finding
-from workers.scape.evidence.inside import shares_inside
+from workers.scape.evidence.inside import share_inside
 from workers.scape.fit.verdict import part_in_words
-from workers.scape.model.body_model import BodyModel
+from workers.scape.model.body_model import HAND, BodyModel
 
 Array = NDArray[np.float64]
 
@@ -19,22 +19,25 @@ _HEAD_TURN_RAD = 0.8
 """Turn of the head against the chest from which it was not found: up to 0.4 in 50 sound scans, 1.5
 to 2.4 where the readings of head and neck are missing and the neck bends to what is left."""
 _INSIDE = 0.3
-"""Share of a forearm inside the body from which the arm was not found: 0 in sound scans, 0.54 and
-more where the fit put the arm into the trunk, whose points then pass for the arm's."""
+"""Share of a forearm, or of a hand, inside the body from which the arm was not found: 0 in sound
+scans, 0.54 and more where the fit put the arm into the trunk, whose points then pass for the arm's.
+A forearm that gave no reading was bent to the trunk with 0.5 of the hand and 0.28 of itself inside,
+and passed for sound."""
 
 
 def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
-    """Reasons by the forearm that lies inside the body.
+    """Reasons by the forearm that lies inside the body, or whose hand does.
 
     Args:
         vertices: (P, 3), the fitted surface before crossings are mended.
     """
-    shares = shares_inside(model, vertices, [f"forearm_{side}" for side in ("left", "right")])
-    return {
-        part: f"the {part_in_words(part)} was not found: hold both arms away from the body"
-        for part, share in shares.items()
-        if share > _INSIDE
-    }
+    reasons = {}
+    for side in ("left", "right"):
+        forearm, hand = f"forearm_{side}", [f"{part}_{side}" for part in HAND]
+        if any(share_inside(model, vertices, parts) > _INSIDE for parts in ([forearm], hand)):
+            words = part_in_words(forearm)
+            reasons[forearm] = f"the {words} was not found: hold both arms away from the body"
+    return reasons
 
 
 def head_turned(model: BodyModel, rotations: Array) -> dict[str, str]:

@@ -202,7 +202,9 @@ def judge(
     reasons = [finding.message for finding in findings] + moved + _unlike_people(stature_m, beta)
     if everywhere:
         reasons.append("too much of the scan does not match a body: nothing can be measured")
-    reasons += [*halves, *list(lost.values())[:_PARTS_NAMED]]
+    # What lies beside a body whose arm or head was not found may be that.
+    told = [reason for part, reason in lost.items() if part or not misplaced]
+    reasons += [*halves, *told[:_PARTS_NAMED]]
     if len(unseen) > _PARTS_NAMED:
         reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
     else:
