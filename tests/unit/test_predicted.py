@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -111,7 +112,8 @@ def test_a_job_tells_the_measurements(
     fit = SimpleNamespace(
         surface=surface, crown_sigma_m=3e-3, patches=(), vertices=np.zeros((3, 3)), state=None
     )
-    job._measured(cast(Any, None), cast(Any, fit), predicted, Stopwatch())
+    with ThreadPoolExecutor(1) as beside:
+        job._measuring(beside, cast(Any, None), cast(Any, fit), predicted, Stopwatch())
     sizes = (0.0, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
     assert [(one.height_sigma_m, one.girth_sigma_m) for one in told] == [sizes, sizes]
     assert {one.crown_sigma_m for one in told} == {3e-3}

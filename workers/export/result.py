@@ -6,8 +6,7 @@ import hashlib
 import json
 import math
 import platform
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -19,7 +18,7 @@ from station import __version__
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.origin import Origin
-from workers.export.preview import Views, preview, views_of
+from workers.export.preview import preview, views_of
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import Content, MeasuredBody, Measurement
 from workers.measure.differences import side_differences
@@ -31,38 +30,36 @@ STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 
 
-@dataclass(frozen=True, slots=True)
-class SurfaceFiles:
-    """Files of a result that need no measurements, made while the body is measured."""
+def surface_files(model: BodyModel, fit: FitResult, origin: Origin) -> dict[str, bytes]:
+    """Files that need no measurements, by name."""
+    about, comments = _about(fit, origin), _comments(fit, origin)
+    cloud = fit.cloud
+    return {
+        "mesh.ply": ply_mesh(fit.vertices, model.faces, comments),
+        "mesh.obj": obj_mesh(fit.vertices, model, comments),
+        "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
+        "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
+    }
 
-    contents: dict[str, bytes]
-    """By file name."""
-    views: Views
 
+def picture_file(model: BodyModel, fit: FitResult, measured: MeasuredBody, origin: Origin) -> bytes:
+    """The preview of a body as scanned.
 
-def surface_files(
-    model: BodyModel, fit: FitResult, origin: Origin, watch: Stopwatch
-) -> SurfaceFiles:
-    """Files that need no measurements, and the preview's pictures of the body."""
-    with watch.step("export"):
-        about, comments = _about(fit, origin), _comments(fit, origin)
-        cloud = fit.cloud
-        contents = {
-            "mesh.ply": ply_mesh(fit.vertices, model.faces, comments),
-            "mesh.obj": obj_mesh(fit.vertices, model, comments),
-            "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
-            "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
-        }
-        forward = -fit.state.rotations[0][:, 1]
-        heading_rad = float(np.arctan2(forward[0], -forward[1]))
-        return SurfaceFiles(contents, views_of(fit.vertices, model.faces, heading_rad))
+    OpenCV reads its fonts once in each thread, which takes 20 ms: call this in a thread that stays.
+    """
+    forward = -fit.state.rotations[0][:, 1]
+    heading_rad = float(np.arctan2(forward[0], -forward[1]))
+    texts = {**origin.to_json(), "verdict": fit.verdict.status}
+    views = views_of(fit.vertices, model.faces, heading_rad)
+    return preview(views, _shown_rows(measured, fit.verdict), fit.verdict, texts)
 
 
 def write_result(
     folder: Path,
     model: BodyModel,
     fit: FitResult,
-    surface: SurfaceFiles,
+    surface: Mapping[str, bytes],
+    picture: bytes,
     measured: MeasuredBody,
     standing: MeasuredBody,
     origin: Origin,
@@ -72,23 +69,20 @@ def write_result(
     """Write a result's files into an existing folder, which the caller publishes.
 
     Args:
+        surface: result of `surface_files`.
+        picture: result of `picture_file`.
         measured: the body as scanned.
         standing: the same body in the standard pose.
     """
     with watch.step("export"):
-        missing = fit.verdict.missing_parts
-        rows = [row for row in measured.rows if not _is_blank(row, missing)]
-        texts = {**origin.to_json(), "verdict": fit.verdict.status}
-        # Drawing releases the interpreter's lock, so it runs beside the other files.
-        with ThreadPoolExecutor(1) as beside:
-            picture = beside.submit(preview, surface.views, rows, fit.verdict, texts)
-            files = {
-                **surface.contents,
-                "mesh.glb": mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin)),
-                "measurements.json": _json(measurements_document(origin, measured, fit.verdict)),
-                STANDARD_POSE_FILE: _json(measurements_document(origin, standing, fit.verdict)),
-                "preview.png": picture.result(),
-            }
+        rows = _shown_rows(measured, fit.verdict)
+        files = {
+            **surface,
+            "mesh.glb": mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin)),
+            "measurements.json": _json(measurements_document(origin, measured, fit.verdict)),
+            STANDARD_POSE_FILE: _json(measurements_document(origin, standing, fit.verdict)),
+            "preview.png": picture,
+        }
         for name, content in files.items():
             (folder / name).write_bytes(content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
@@ -110,6 +104,11 @@ def _comments(fit: FitResult, origin: Origin) -> list[str]:
 def verdict_document(verdict: Verdict) -> dict[str, Any]:
     """Verdict as it stands in the tables and in the glTF files."""
     return {"status": verdict.status, "reasons": list(verdict.reasons)}
+
+
+def _shown_rows(measured: MeasuredBody, verdict: Verdict) -> list[Measurement]:
+    """Rows that have a value."""
+    return [row for row in measured.rows if not _is_blank(row, verdict.missing_parts)]
 
 
 def _is_blank(row: Measurement, missing: frozenset[str]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import atexit
 import gc
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from workers.cloud.preprocess import warm_up as compile_preprocessing
 from workers.export.meshes import obj_mesh
 from workers.export.origin import Origin
 from workers.export.preview import preview, views_of
-from workers.export.result import surface_files, write_result
+from workers.export.result import picture_file, surface_files, write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
 from workers.measure.intervals import ScanErrors
@@ -158,13 +158,19 @@ def _fitted(
         progress("measuring", 0.0)
         # Measuring does not depend on how limbs are separated.
         with ThreadPoolExecutor(1) as beside:
-            measuring = beside.submit(_measured, model, overlapping, scan.predicted, watch)
+            measuring, standing = _measuring(beside, model, overlapping, scan.predicted, watch)
             fit = separate_limbs(model, overlapping, scan.findings, observer)
-            surface = surface_files(model, fit, origin, watch)
-            measured, standing = measuring.result()
-        watch.seconds.update(fit.seconds)
+            watch.seconds.update(fit.seconds)
+            filing = beside.submit(surface_files, model, fit, origin)
+            measured = measuring.result()
+            with watch.step("export"):
+                picture = picture_file(model, fit, measured, origin)
+                surface = filing.result()
         progress("writing", 0.0)
-        write_result(out_folder, model, fit, surface, measured, standing, origin, method, watch)
+        write_result(
+            out_folder, model, fit, surface, picture, measured, standing.result(), origin, method,
+            watch,
+        )  # fmt: skip
     progress("done", 1.0)
     evidence = None
     if overlapping.evidence is not None and fit.verdict.status == "ok":
@@ -174,17 +180,27 @@ def _fitted(
     return JobSummary(fit.verdict.status, fit.verdict.reasons, evidence)
 
 
-def _measured(
-    model: BodyModel, fit: OverlappingFit, predicted: PredictedError | None, watch: Stopwatch
-) -> tuple[MeasuredBody, MeasuredBody]:
-    """Measurements as scanned, and in the standard standing pose."""
-    with watch.step("measure"):
-        sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
-        errors = scan_errors(model, fit, predicted)
-        return (
-            measure_body(model, fit.vertices, sigma_m, seen, errors),
-            measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors),
-        )
+def _measuring(
+    beside: ThreadPoolExecutor,
+    model: BodyModel,
+    fit: OverlappingFit,
+    predicted: PredictedError | None,
+    watch: Stopwatch,
+) -> tuple[Future[MeasuredBody], Future[MeasuredBody]]:
+    """Start to measure the body as scanned, then in the standard standing pose."""
+    sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
+
+    def as_scanned() -> MeasuredBody:
+        with watch.step("measure"):
+            errors = scan_errors(model, fit, predicted)
+            return measure_body(model, fit.vertices, sigma_m, seen, errors)
+
+    def upright() -> MeasuredBody:
+        with watch.step("measure"):
+            errors = scan_errors(model, fit, predicted)
+            return measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors)
+
+    return beside.submit(as_scanned), beside.submit(upright)
 
 
 def scan_errors(

@@ -100,12 +100,13 @@ def real_result() -> Callable[[Path], None]:
     model = job.warm_up()
     with mock.patch.object(job, "write_result", keep):
         job.reconstruct_cloud(job._mean_cloud(model), SCAN, Path("unused"), model=model)
-    model, fit, cloud, measured, standing, _, method, _ = kept[0]
+    model, fit, surface, picture, measured, standing, _, method, _ = kept[0]
 
     def write(folder: Path) -> None:
         write_result(
-            folder, model, fit, cloud, measured, standing, Origin(SCAN), method, Stopwatch()
-        )
+            folder, model, fit, surface, picture, measured, standing, Origin(SCAN), method,
+            Stopwatch(),
+        )  # fmt: skip
 
     return write
 
