@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -20,6 +20,7 @@ from station.simulation.scene import default_rig
 from workers.export.stopwatch import Stopwatch
 from workers.measure.intervals import ScanErrors
 from workers.reconstruct import job
+from workers.scape.fit.unmatched import Patch
 
 SAID = PredictedError(1e-3, 1.5e-3, 0.5e-3, 2e-4)
 RMS_M, SECONDS = 2e-3, 16
@@ -109,8 +110,10 @@ def test_a_job_tells_the_measurements(
     for skin in ("patch_sigma_m", "hidden_head_sigma"):
         monkeypatch.setattr(job, skin, lambda *_: np.zeros(3))
     surface = SimpleNamespace(sigma_m=np.zeros(3), seen=np.ones(3, bool))
+    patches = Future[tuple[Patch, ...]]()
+    patches.set_result(())
     fit = SimpleNamespace(
-        surface=surface, crown_sigma_m=3e-3, patches=(), vertices=np.zeros((3, 3)), state=None
+        surface=surface, crown_sigma_m=3e-3, patches=patches, vertices=np.zeros((3, 3)), state=None
     )
     with ThreadPoolExecutor(1) as beside:
         job._measuring(beside, cast(Any, None), cast(Any, fit), predicted, Stopwatch())

@@ -212,7 +212,7 @@ def scan_errors(
         predicted: errors of the calibration; None if it does not say.
     """
     skin = np.hypot(
-        patch_sigma_m(model, fit.patches),
+        patch_sigma_m(model, fit.patches.result()),
         hidden_head_sigma(model, fit.surface.seen, fit.crown_sigma_m),
     )
     errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m, skin_sigma_m=skin)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Literal
@@ -111,8 +111,8 @@ class OverlappingFit:
     separated."""
     crown_sigma_m: float
     """Standard deviation of the top of the head, in excess of an ordinary scan's."""
-    patches: tuple[Patch, ...]
-    """Patches of the scan that the surface does not explain."""
+    patches: Future[tuple[Patch, ...]]
+    """Patches of the scan that the surface does not explain, which are searched for meanwhile."""
     cloud: PointCloud
     correspondences: int
     iterations: int
@@ -200,7 +200,10 @@ def fit_overlapping(
     crown_sigma = crown_sigma_m(
         model, scan.views, poses, surface.vertices, cloud.points, surface.seen
     )
-    patches = unmatched_patches(model, surface.vertices, cloud)
+    # Only intervals and verdict need these, so that whoever separates limbs does not wait for them.
+    beside = ThreadPoolExecutor(1)
+    patches = beside.submit(unmatched_patches, model, surface.vertices, cloud)
+    beside.shutdown(wait=False)
     return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),
@@ -234,7 +237,7 @@ def separate_limbs(
     rotations = fit.state.rotations
     findings = [*findings, *leaning(model, rotations)]
     misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
-    lost = lost_parts(model, fit.patches)
+    lost = lost_parts(model, fit.patches.result())
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m

@@ -56,7 +56,12 @@ def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> t
     shape = tuple(int(n) for n in cells.max(axis=0) + 2)
     if np.prod(shape, dtype=np.float64) > _MAX_CELLS:
         return ()
-    cell, chosen = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_index=True)
+    of_point = np.ravel_multi_index(tuple(cells.T), shape)
+    # The first point of each cube; assignments to one place leave the last.
+    first = np.full(np.prod(shape), -1)
+    first[of_point[::-1]] = np.arange(len(cells))[::-1]
+    cell = np.flatnonzero(first >= 0)
+    chosen = first[cell]
     points = cloud.points[chosen]
     _, near = cKDTree(vertices).query(points)
     places = attached(model, vertices, points, near)
