@@ -18,7 +18,8 @@ from workers.scape.model.deformation import (
     neighbours,
     vertex_normals,
 )
-from workers.scape.model.kernels import descend, trimmed_costs
+from workers.scape.model.halves import WORTH_A_THREAD, in_halves
+from workers.scape.model.kernels import descend, interpolated, side_by_side, trimmed_costs
 from workers.scape.model.sampled import SampledBody
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
@@ -202,3 +203,21 @@ def test_a_start_faces_the_other_way_for_toes_that_show_the_wrong_way(model: Bod
     for side in ("left", "right"):
         hand = model.part_of_vertex == model.part_names.index(f"hand_{side}")
         assert np.linalg.norm((best - vertices)[hand].mean(axis=0)) < 0.3
+
+
+@pytest.mark.parametrize("count", [0, 7, WORTH_A_THREAD, 2 * WORTH_A_THREAD + 1])
+def test_halves_give_each_item_once_and_in_order(count: int) -> None:
+    items = np.arange(count)
+    same, twice = in_halves(lambda part: (items[part], 2 * items[part]), count)
+    assert np.array_equal(same, items)
+    assert np.array_equal(twice, 2 * items)
+
+
+def test_places_are_interpolated_and_directions_scaled() -> None:
+    rng = np.random.default_rng(1)
+    triangle, weights = rng.integers(0, len(BALL.faces), 50), rng.random((50, 3))
+    found = interpolated(BALL.vertices, BALL.faces, triangle, weights)
+    corners = BALL.vertices[BALL.faces[triangle]]
+    assert np.allclose(found, np.einsum("nc,nci->ni", weights, corners), rtol=1e-14)
+    joined = side_by_side(found, weights, 0.04)
+    assert np.array_equal(joined, np.concatenate([found, 0.04 * weights], axis=1))

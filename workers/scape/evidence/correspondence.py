@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from workers.scape.model.deformation import Graph
-from workers.scape.model.kernels import descend
+from workers.scape.model.halves import WORTH_A_THREAD, in_halves
+from workers.scape.model.kernels import descend, side_by_side
 
 Array = NDArray[np.float64]
 
@@ -18,8 +18,6 @@ _DIRECTION_SCALE_M = 0.04
 """Scale of normals in the search space: opposite normals count as 8 cm of distance."""
 _SEARCHED_EVERY = 4
 """Step between the dense points that are searched for; the others start from their results."""
-_WORTH_A_THREAD = 5000
-"""Number of queries from which a second thread saves time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +103,13 @@ class TrackedPoints:
     def _descended(
         self, nodes: Array, start: NDArray[np.intp], square: float, product: float
     ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """`descend` for both halves of the points, in two threads."""
-        count = len(start)
-        with ThreadPoolExecutor(_threads(count)) as pool:
-            halves = pool.map(
-                lambda half: descend(
-                    self._place[half], nodes, *self._graph, start[half], square, product
-                ),
-                (slice(0, count // 2), slice(count // 2, count)),
-            )
-            here, kept = (np.concatenate(parts) for parts in zip(*halves, strict=True))
+        """`descend` for all points, in two threads."""
+        here, kept = in_halves(
+            lambda part: descend(
+                self._place[part], nodes, *self._graph, start[part], square, product
+            ),
+            len(start),
+        )
         return here, kept
 
     def _starting_vertices(self, tree: OrientedTree, limits: dict[str, float]) -> NDArray[np.intp]:
@@ -127,11 +122,11 @@ class TrackedPoints:
 
 
 def _threads(queries: int) -> int:
-    return 2 if queries > _WORTH_A_THREAD else 1
+    return 2 if queries > WORTH_A_THREAD else 1
 
 
 def _joined(points: Array, normals: Array) -> Array:
-    return np.concatenate([points, _DIRECTION_SCALE_M * normals], axis=1)
+    return np.asarray(side_by_side(points, normals, _DIRECTION_SCALE_M))
 
 
 def compatible(

@@ -106,7 +106,7 @@ def is_head_hidden(model: BodyModel, vertices: Array, cloud: Array) -> bool:
     high = cloud[cloud[:, 2] > head[:, 2].min() - _AT_HEAD_M]
     if not len(high):
         return True
-    away, _ = cKDTree(high).query(head, distance_upper_bound=_AT_HEAD_M)
+    away, _ = cKDTree(high, balanced_tree=False).query(head, distance_upper_bound=_AT_HEAD_M)
     return bool(np.isfinite(away).mean() < _HEAD_SHOWN)
 
 

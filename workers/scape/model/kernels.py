@@ -197,6 +197,32 @@ def edge_sums(vertices, faces, matrices, weights):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True)
+def side_by_side(points, directions, scale):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Points (n, 3) and scaled directions (n, 3) in one array (n, 6)."""
+    out = np.empty((len(points), 6))
+    for p in range(len(points)):
+        for i in range(3):
+            out[p, i] = points[p, i]
+            out[p, 3 + i] = scale * directions[p, i]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def interpolated(values, corners, triangle, weights):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Values (P, k) at the corners (K, 3) of triangles (n,), with weights (n, 3) to (n, k)."""
+    out = np.empty((len(triangle), values.shape[1]))
+    for p in range(len(triangle)):
+        a, b, c = corners[triangle[p], 0], corners[triangle[p], 1], corners[triangle[p], 2]
+        for i in range(values.shape[1]):
+            out[p, i] = (
+                weights[p, 0] * values[a, i]
+                + weights[p, 1] * values[b, i]
+                + weights[p, 2] * values[c, i]
+            )
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def descend(points, nodes, first, neighbours, start, square, product):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Descend for each point to a node of a graph that is nearer than all its neighbours.
 

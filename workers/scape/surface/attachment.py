@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces
+from workers.scape.model.halves import in_halves
+from workers.scape.model.kernels import interpolated
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -31,7 +33,7 @@ class Attachments:
 
     def of(self, values: Array, faces: Faces) -> Array:
         """(n, k): values (P, k) of the vertices, interpolated."""
-        return np.einsum("nc,nci->ni", self.weights, values[faces[self.triangle]])
+        return np.asarray(interpolated(values, faces, self.triangle, self.weights))
 
     def chosen(self, which: NDArray[np.bool_]) -> Attachments:
         """Some of the places, by a mask (n,)."""
@@ -47,8 +49,12 @@ def attached(
         vertices: (P, 3), the surface.
         near: (n,): vertices near the points.
     """
-    found = _nearest_places(points, near, *_triangles_around(model), model.faces, vertices)
-    return Attachments(*found)
+    around = _triangles_around(model)
+    triangle, weights = in_halves(
+        lambda part: _nearest_places(points[part], near[part], *around, model.faces, vertices),
+        len(points),
+    )
+    return Attachments(triangle, weights)
 
 
 @lru_cache(maxsize=2)
