@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import open3d as o3d
@@ -14,7 +13,6 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from workers.cloud.observed import PointCloud
-from workers.scape.evidence.crown import crown_rows
 from workers.scape.model.body_model import HAND, BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import attached
@@ -125,7 +123,7 @@ def test_a_hand_unlike_the_model_is_followed(model: BodyModel) -> None:
         np.zeros(count, np.int16),
         ("front-upper",),
     )
-    fitted = fit_surface(model, model.vertices(neutral), cloud, partial(crown_rows, model, [], []))
+    fitted = fit_surface(model, model.vertices(neutral), cloud, [], [])
     near = cKDTree(fitted.vertices).query(body)[1]
     places = attached(model, fitted.vertices, body, near).of(fitted.vertices, model.faces)
     away = np.linalg.norm(places - body, axis=1)

@@ -43,6 +43,7 @@ from workers.scape.fit.unmatched import patch_sigma_m
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
+from workers.scape.surface.contours import warm_up as compile_contours
 from workers.scape.surface.uncertainty import hidden_head_sigma
 
 Progress = Callable[[str, float], None]
@@ -68,6 +69,7 @@ def warm_up() -> BodyModel:
     """
     model = load_model()
     compile_preprocessing()
+    compile_contours()
     cloud = _mean_cloud(model)
     fit = fit_body(model, Preprocessed(cloud, (), ()))
     # A bare cloud has no cameras that could be off.

@@ -23,7 +23,7 @@ from workers.cloud.observed import (
     Preprocessed,
 )
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
-from workers.scape.evidence.crown import crown_rows, crown_sigma_m
+from workers.scape.evidence.crown import crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
 from workers.scape.fit.hands import place_hands
@@ -194,8 +194,7 @@ def fit_overlapping(
         fitted = time.monotonic()
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
-        crown = partial(crown_rows, model, scan.views, cameras.poses(scan.views))
-        surface = fit_surface(model, reference, cloud, crown)
+        surface = fit_surface(model, reference, cloud, scan.views, cameras.poses(scan.views))
     poses = cameras.poses(scan.views)
     crown_sigma = crown_sigma_m(
         model, scan.views, poses, surface.vertices, cloud.points, surface.seen

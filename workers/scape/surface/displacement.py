@@ -14,20 +14,22 @@ did. Rounds narrow the gate and weaken the prior.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.cloud.observed import PointCloud
+from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.correspondence import TrackedPoints
+from workers.scape.evidence.crown import crown_rows
 from workers.scape.evidence.floor import stand_on_floor
 from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import Attachments, attached
+from workers.scape.surface.contours import contour_places, contour_rows, edge_offsets_px
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import offset_prior
 from workers.scape.surface.uncertainty import surface_sigma
@@ -189,34 +191,50 @@ def fit_surface(
     model: BodyModel,
     vertices: Array,
     cloud: PointCloud,
-    crown: Callable[[Array], Rows],
+    views: Sequence[CameraView],
+    poses: Sequence[Array],
 ) -> SurfaceFit:
-    """Fit the model's surface to a cloud and to the top of the head.
+    """Fit the model's surface to a cloud, to the top of the head and to contours.
+
+    There are no points at the top of the head and where skin turns away from all cameras, so the
+    smooth field alone would carry on the trend of the points around it. Contours count from the
+    second round on: what their edges are off by shows on a surface that follows the points.
 
     Args:
         vertices: (P, 3), the model's surface.
-        crown: rows for the top of the head, a function of the current vertices. There are no points
-            there, so the smooth field alone would carry on the trend of the points around it.
+        views: the cameras' images; none for a bare cloud.
+        poses: corrected world_from_camera (4, 4) of each.
     """
     readings = _Readings.build(model, cloud)
     prior = offset_prior(model)
     offset = np.zeros_like(vertices)
     before: _AtVertices | None = None
+    edges_px: Array | None = None
+    outlined = np.zeros(len(vertices), bool)
     for round_ in _ROUNDS:
         current = vertices + offset
         used, vertex, places = readings.placed(
             model, current, round_.angle_rad, gate_m=round_.gate_m
         )
         away = readings.away_m(used, places.of(vertices, model.faces))
+        rows = [
+            OffsetRows(places, readings.directions[used], away, readings.information[used]),
+            _crown_rows(model, crown_rows(model, views, poses, current), offset),
+        ]
         if before is None:
             before = readings.at_vertices(used, vertex, away, len(vertices))
             sigma_m = _offset_sigma_m(model, before, readings.noise_m)
-        rows = OffsetRows(places, readings.directions[used], away, readings.information[used])
-        rows = OffsetRows.joined(rows, _crown_rows(model, crown(current), offset))
+        elif views:
+            contours = contour_places(model, views, poses, current)
+            if edges_px is None:
+                edges_px = edge_offsets_px(contours, len(views))
+            rows.append(contour_rows(model, contours, edges_px, offset))
+            outlined[:] = False
+            outlined[model.faces[rows[-1].at.triangle]] = True
         of_round_m = sigma_m / np.sqrt(round_.stiffness)
-        offset = solved(model, prior, of_round_m, rows, offset, round_.enough)
+        offset = solved(model, prior, of_round_m, OffsetRows.joined(*rows), offset, round_.enough)
     assert before is not None
-    return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
+    return _examined(model, stand_on_floor(model, vertices + offset), readings, before, outlined)
 
 
 def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Array:
@@ -247,12 +265,17 @@ def _of_ends(model: BodyModel) -> NDArray[np.bool_]:
 
 
 def _examined(
-    model: BodyModel, vertices: Array, readings: _Readings, before: _AtVertices
+    model: BodyModel,
+    vertices: Array,
+    readings: _Readings,
+    before: _AtVertices,
+    outlined: NDArray[np.bool_],
 ) -> SurfaceFit:
     """A fitted surface (P, 3) with what is known of it.
 
     Args:
         before: what the cloud said at the vertices before the surface was displaced.
+        outlined: (P,), vertices of triangles on a contour.
     """
     used, vertex, places = readings.placed(model, vertices, _ROUNDS[-1].angle_rad, reach_m=_SEEN_M)
     away = readings.away_m(used, places.of(vertices, model.faces))
@@ -264,7 +287,7 @@ def _examined(
     measured[model.faces[places.triangle[on_surface]]] = True
     return SurfaceFit(
         vertices=vertices,
-        sigma_m=surface_sigma(model, seen, before.residual_m, before.observed),
+        sigma_m=surface_sigma(model, seen | outlined, before.residual_m, before.observed),
         seen=seen,
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,
