@@ -10,12 +10,17 @@ from station.simulation.scene import Mesh, VirtualScene, booth_walls, default_ri
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
-from workers.scape.surface.contours import contour_places, contour_rows, edge_offsets_px
+from workers.scape.surface.contours import (
+    _edges_on_lines,
+    contour_places,
+    contour_rows,
+    side_offsets_px,
+)
 from workers.scape.surface.displacement import fit_surface
 
 CAMERAS = [default_rig().cameras[name] for name in ("front-lower", "back-lower")]
 POSES = [camera.world_from_camera for camera in CAMERAS]
-RIGHT_EDGES = [1, 3]
+RIGHT_SIDES = [1, 3]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,7 @@ def _views(
     views = []
     for camera in CAMERAS:
         seen = scene.view(camera, camera.world_from_camera)
-        person = (seen.depth_m > 0.0) & (seen.depth_m < 2.0) & (seen.incidence_rad < np.pi)
+        person = (seen.depth_m > 0.0) & (seen.depth_m < 2.0)
         steep = person & (seen.incidence_rad > np.radians(71.0))
         depth = np.where(seen.lit & seen.reflects & ~steep, seen.depth_m, 0.0).astype(np.float32)
         if wider_px:
@@ -81,11 +86,11 @@ def _cloud(model: BodyModel, body: np.ndarray) -> PointCloud:
 def test_right_edges_agree_with_the_true_surface(model: BodyModel, body: np.ndarray) -> None:
     """The projector's shadow hides those on the left."""
     places = contour_places(model, _views(model, body), POSES, body)
-    offsets = edge_offsets_px(places, len(POSES))
-    assert np.isfinite(offsets[RIGHT_EDGES]).all()
-    assert (np.abs(offsets[RIGHT_EDGES]) < 1.0).all()
-    for edge in RIGHT_EDGES:
-        away = places.beyond_px[places.edge == edge] - offsets[edge]
+    offsets = side_offsets_px(places, len(POSES))
+    assert np.isfinite(offsets[RIGHT_SIDES]).all()
+    assert (np.abs(offsets[RIGHT_SIDES]) < 1.0).all()
+    for side in RIGHT_SIDES:
+        away = places.beyond_px[places.side == side] - offsets[side]
         assert np.median(np.abs(away)) < 0.5
     rows = contour_rows(model, places, offsets, np.zeros_like(body))
     assert np.median(np.abs(rows.residual_m)) < 0.0015
@@ -116,13 +121,30 @@ def test_skin_that_no_camera_sees_follows_its_contour(
 
 def test_without_anything_behind_there_are_no_contours(model: BodyModel, body: np.ndarray) -> None:
     places = contour_places(model, _views(model, body, walls=False), POSES, body)
-    assert np.isnan(edge_offsets_px(places, len(POSES))).all()
+    assert np.isnan(side_offsets_px(places, len(POSES))).all()
 
 
 def test_edges_that_scatter_are_not_used(model: BodyModel, body: np.ndarray) -> None:
     places = contour_places(model, _views(model, body), POSES, body)
     rng = np.random.default_rng(3)
-    scattered = replace(places, beyond_px=rng.uniform(-6.0, 6.0, len(places.edge)))
-    assert np.isnan(edge_offsets_px(scattered, len(POSES))).all()
+    scattered = replace(places, beyond_px=rng.uniform(-6.0, 6.0, len(places.side)))
+    assert np.isnan(side_offsets_px(scattered, len(POSES))).all()
     rows = contour_rows(model, places, np.full(2 * len(POSES), np.nan), np.zeros_like(body))
     assert not len(rows.weight)
+
+
+def test_a_hole_in_the_background_is_no_edge() -> None:
+    """The limb ends at pixel 49, the wall begins at 50 and has no reading at 52. From a place that
+    lies 2.5 px too far out, the hole was the nearer edge."""
+    row = np.where(np.arange(100) < 50, 1.7, 3.4).astype(np.float32)
+    row[52] = 0.0
+    depth = np.repeat(row[None], 20, axis=0)
+    place = np.array([[52.0, 10.0], [np.nan, 10.0], [52.0, 300.0]])
+    across, depth_m = np.array([[1.0, 0.0]] * 3), np.full(3, 1.7)
+    edges = _edges_on_lines(depth, place, across, depth_m)
+    assert np.allclose(edges[0], -2.5, atol=0.5)
+    assert np.isnan(edges[1:]).all()
+    # Nothing of a limb that something nearer hides, nor one that ends in a wide shadow.
+    assert np.isnan(_edges_on_lines(depth, place, across, depth_m + 0.5)).all()
+    depth[:, 45:52] = 0.0
+    assert np.isnan(_edges_on_lines(depth, place, across, depth_m)).all()

@@ -167,7 +167,7 @@ def _fitted(
             measured = measuring.result()
             with watch.step("export"):
                 picture = picture_file(model, fit, measured, origin)
-                surface = filing.result()
+            surface = filing.result()
         progress("writing", 0.0)
         write_result(
             out_folder, model, fit, surface, picture, measured, standing.result(), origin, method,
@@ -192,15 +192,15 @@ def _measuring(
     """Start to measure the body as scanned, then in the standard standing pose."""
     sigma_m, seen = fit.surface.sigma_m, fit.surface.seen
 
+    errors = beside.submit(scan_errors, model, fit, predicted)
+
     def as_scanned() -> MeasuredBody:
         with watch.step("measure"):
-            errors = scan_errors(model, fit, predicted)
-            return measure_body(model, fit.vertices, sigma_m, seen, errors)
+            return measure_body(model, fit.vertices, sigma_m, seen, errors.result())
 
     def upright() -> MeasuredBody:
         with watch.step("measure"):
-            errors = scan_errors(model, fit, predicted)
-            return measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors)
+            return measure_standing(model, fit.vertices, fit.state, sigma_m, seen, errors.result())
 
     return beside.submit(as_scanned), beside.submit(upright)
 

@@ -7,8 +7,8 @@ slant they fade, and silhouettes flicker.
 
 A sensor does not draw edges where they are: it blurs, erodes or widens them, and a camera that
 stands a millimetre aside shifts them all. So for each camera the left and the right edges have an
-offset of their own, the mean over the whole body of what they differ by from a surface that follows
-the readings. What is used is how one place of the contour differs from the others.
+offset of their own, the mean over trunk, limbs and head of what they differ by from a surface that
+follows the readings. What is used is how one place of the contour differs from the others.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ shadow is wider, and hides where the person ends."""
 _SAME_M, _BEHIND_M = 0.06, 0.12
 """Largest difference in depth of readings on the same limb, least to what is behind it."""
 _MIN_SIDEWAYS = 0.5
-"""Least share of an outline's direction along the image's rows: the projector is beside the camera,
-so that upper and lower edges are others than left and right ones."""
+"""Least share along the image's rows of the direction across an outline: the projector is beside
+the camera, so that upper and lower edges are others than left and right ones."""
 _SIGMA_PX = 0.6
 """Standard deviation of a place of a contour in the image ..."""
 _INDEPENDENT = 0.15
@@ -56,7 +56,7 @@ _ROBUST_PX = 2.5
 """Scale of the robust weight (Geman & McClure): larger distances are weighted down."""
 _MIN_PLACES = 40
 _MAX_OFFSET_PX, _MAX_SPREAD_PX = 4.0, 2.0
-"""An edge is used if it shows at least so many places, with a median and a spread (median absolute
+"""A side is used if it shows at least so many places, with a median and a spread (median absolute
 deviation, for a normal distribution) of at most this: sound ones have 1 px and 0.7. The projector's
 shadow leaves the edges of one side with few places."""
 _NORMAL_MAD = 1.4826
@@ -78,10 +78,10 @@ class ContourPlaces:
     outwards: Array
     """(n, 3): unit vectors across the contour, perpendicular to the ray."""
     beyond_px: Array
-    """(n,): distance by which the place lies beyond the contour."""
+    """(n,): distance in the image by which the place lies beyond its edge."""
     pixel_m: Array
     """(n,): size of a pixel there."""
-    edge: Index
+    side: Index
     """(n,): twice the index of the camera, plus 1 for a right edge."""
 
     @classmethod
@@ -96,8 +96,16 @@ class ContourPlaces:
             np.concatenate([one.outwards for one in pieces]),
             np.concatenate([one.beyond_px for one in pieces]),
             np.concatenate([one.pixel_m for one in pieces]),
-            np.concatenate([one.edge for one in pieces]),
+            np.concatenate([one.side for one in pieces]),
         )
+
+    def agreeing(self, offsets_px: Array) -> Attachments:
+        """Places on the surface that lie where their edges say, within the robust weight's scale.
+
+        Args:
+            offsets_px: as `side_offsets_px` gives them.
+        """
+        return self.at.chosen(np.abs(offsets_px[self.side] - self.beyond_px) < _ROBUST_PX)
 
 
 def contour_places(
@@ -117,17 +125,17 @@ def contour_places(
     )
 
 
-def edge_offsets_px(places: ContourPlaces, cameras: int) -> Array:
-    """Offset (2 cameras,) of each edge of each camera; NaN where it is not known."""
+def side_offsets_px(places: ContourPlaces, cameras: int) -> Array:
+    """Offset (2 cameras,) of the edges on each side of each camera; NaN where it is not known."""
     offsets = np.full(2 * cameras, np.nan)
-    for edge in range(2 * cameras):
-        beyond = places.beyond_px[places.edge == edge]
+    for side in range(2 * cameras):
+        beyond = places.beyond_px[places.side == side]
         if len(beyond) < _MIN_PLACES:
             continue
         middle = float(np.median(beyond))
         spread = _NORMAL_MAD * float(np.median(np.abs(beyond - middle)))
         if abs(middle) <= _MAX_OFFSET_PX and spread <= _MAX_SPREAD_PX:
-            offsets[edge] = beyond[np.abs(beyond - middle) < _NEAR_MEDIAN_PX].mean()
+            offsets[side] = beyond[np.abs(beyond - middle) < _NEAR_MEDIAN_PX].mean()
     return offsets
 
 
@@ -137,10 +145,10 @@ def contour_rows(
     """Rows on the surface's whole offset (P, 3).
 
     Args:
-        offsets_px: as `edge_offsets_px` gives them.
+        offsets_px: as `side_offsets_px` gives them.
         offset: (P, 3), the present offset of the surface on which the places are.
     """
-    away_px = offsets_px[places.edge] - places.beyond_px
+    away_px = offsets_px[places.side] - places.beyond_px
     used = np.isfinite(away_px)
     at, outwards = places.at.chosen(used), places.outwards[used]
     away_px, pixel_m = away_px[used], places.pixel_m[used]
@@ -167,7 +175,7 @@ def _places(
     pixels = project(calibration, local)
     moved = local + pixel_m[:, None] * (outwards @ pose[:3, :3])
     across = _unit(project(calibration, moved) - pixels)
-    edge_px = _edge_px(view, pixels, across, local[:, 2])
+    edge_px = _edge_px(view, pixels, across, np.ascontiguousarray(local[:, 2]))
     kept = np.isfinite(edge_px) & (np.abs(across[:, 0]) > _MIN_SIDEWAYS)
     turning, share = turning[kept], share[kept]
     weights, index = np.zeros((len(turning), 3)), np.arange(len(turning))
@@ -218,7 +226,9 @@ def _edges_on_lines(depth, pixels, across, depth_m):  # type: ignore[no-untyped-
                 begins = behind and not was_behind and step - on_limb <= _GAP_STEPS
                 if begins and abs(between) < nearest:
                     nearest, found[p, line] = abs(between), between
-                if reading > 0.0 and abs(reading - depth_m[p]) < _SAME_M:
+                if behind:
+                    on_limb = -_GAP_STEPS - 1
+                elif reading > 0.0 and abs(reading - depth_m[p]) < _SAME_M:
                     on_limb = step
                 was_behind = behind
     return found

@@ -29,7 +29,7 @@ from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import Attachments, attached
-from workers.scape.surface.contours import contour_places, contour_rows, edge_offsets_px
+from workers.scape.surface.contours import contour_places, contour_rows, side_offsets_px
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import offset_prior
 from workers.scape.surface.uncertainty import surface_sigma
@@ -209,7 +209,7 @@ def fit_surface(
     prior = offset_prior(model)
     offset = np.zeros_like(vertices)
     before: _AtVertices | None = None
-    edges_px: Array | None = None
+    sides_px: Array | None = None
     outlined = np.zeros(len(vertices), bool)
     for round_ in _ROUNDS:
         current = vertices + offset
@@ -226,11 +226,11 @@ def fit_surface(
             sigma_m = _offset_sigma_m(model, before, readings.noise_m)
         elif views:
             contours = contour_places(model, views, poses, current)
-            if edges_px is None:
-                edges_px = edge_offsets_px(contours, len(views))
-            rows.append(contour_rows(model, contours, edges_px, offset))
+            if sides_px is None:
+                sides_px = side_offsets_px(contours, len(views))
+            rows.append(contour_rows(model, contours, sides_px, offset))
             outlined[:] = False
-            outlined[model.faces[rows[-1].at.triangle]] = True
+            outlined[model.faces[contours.agreeing(sides_px).triangle]] = True
         of_round_m = sigma_m / np.sqrt(round_.stiffness)
         offset = solved(model, prior, of_round_m, OffsetRows.joined(*rows), offset, round_.enough)
     assert before is not None
