@@ -99,14 +99,6 @@ class ContourPlaces:
             np.concatenate([one.side for one in pieces]),
         )
 
-    def agreeing(self, offsets_px: Array) -> Attachments:
-        """Places on the surface that lie where their edges say, within the robust weight's scale.
-
-        Args:
-            offsets_px: as `side_offsets_px` gives them.
-        """
-        return self.at.chosen(np.abs(offsets_px[self.side] - self.beyond_px) < _ROBUST_PX)
-
 
 def contour_places(
     model: BodyModel, views: Sequence[CameraView], poses: Sequence[Array], vertices: Array

@@ -210,7 +210,6 @@ def fit_surface(
     offset = np.zeros_like(vertices)
     before: _AtVertices | None = None
     sides_px: Array | None = None
-    outlined = np.zeros(len(vertices), bool)
     for round_ in _ROUNDS:
         current = vertices + offset
         used, vertex, places = readings.placed(
@@ -229,12 +228,10 @@ def fit_surface(
             if sides_px is None:
                 sides_px = side_offsets_px(contours, len(views))
             rows.append(contour_rows(model, contours, sides_px, offset))
-            outlined[:] = False
-            outlined[model.faces[contours.agreeing(sides_px).triangle]] = True
         of_round_m = sigma_m / np.sqrt(round_.stiffness)
         offset = solved(model, prior, of_round_m, OffsetRows.joined(*rows), offset, round_.enough)
     assert before is not None
-    return _examined(model, stand_on_floor(model, vertices + offset), readings, before, outlined)
+    return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
 
 
 def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Array:
@@ -265,17 +262,12 @@ def _of_ends(model: BodyModel) -> NDArray[np.bool_]:
 
 
 def _examined(
-    model: BodyModel,
-    vertices: Array,
-    readings: _Readings,
-    before: _AtVertices,
-    outlined: NDArray[np.bool_],
+    model: BodyModel, vertices: Array, readings: _Readings, before: _AtVertices
 ) -> SurfaceFit:
     """A fitted surface (P, 3) with what is known of it.
 
     Args:
         before: what the cloud said at the vertices before the surface was displaced.
-        outlined: (P,), vertices of triangles on a contour.
     """
     used, vertex, places = readings.placed(model, vertices, _ROUNDS[-1].angle_rad, reach_m=_SEEN_M)
     away = readings.away_m(used, places.of(vertices, model.faces))
@@ -287,7 +279,7 @@ def _examined(
     measured[model.faces[places.triangle[on_surface]]] = True
     return SurfaceFit(
         vertices=vertices,
-        sigma_m=surface_sigma(model, seen | outlined, before.residual_m, before.observed),
+        sigma_m=surface_sigma(model, seen, before.residual_m, before.observed),
         seen=seen,
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,

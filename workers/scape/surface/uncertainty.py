@@ -48,18 +48,18 @@ _FARTHEST_M = 1.0
 """Distances to readings count up to this."""
 
 
-def surface_sigma(model: BodyModel, known: Mask, mismatch_m: Array, observed: Mask) -> Array:
+def surface_sigma(model: BodyModel, seen: Mask, mismatch_m: Array, observed: Mask) -> Array:
     """Standard deviation (P,) along the normals, metres.
 
     Args:
-        known: (P,): readings lie on the vertex or next to it, or a contour does.
+        seen: (P,): readings lie on the vertex or next to it.
         mismatch_m: (P,): mean distance of the vertex's readings from the model's surface ...
         observed: (P,): ... where there were any.
     """
     if not observed.any():
-        return np.full(len(known), _DRIFT * _FARTHEST_M)
+        return np.full(len(seen), _DRIFT * _FARTHEST_M)
     prior = offset_prior(model)
-    away = np.minimum(prior.distance_m(known), _FARTHEST_M)
+    away = np.minimum(prior.distance_m(seen), _FARTHEST_M)
     around = _amplitude_square(prior, mismatch_m, observed)
     further = np.clip(around - _FAMILY_MISMATCH_M**2, 0.0, _MAX_FURTHER_M**2)
     further *= _unknown_share(away) + _LEFT_WHERE_SEEN**2
