@@ -15,6 +15,7 @@ from workers.scape.surface.contours import (
     contour_places,
     contour_rows,
     side_offsets_px,
+    warm_up,
 )
 from workers.scape.surface.displacement import fit_surface
 
@@ -148,3 +149,10 @@ def test_a_hole_in_the_background_is_no_edge() -> None:
     assert np.isnan(_edges_on_lines(depth, place, across, depth_m + 0.5)).all()
     depth[:, 45:52] = 0.0
     assert np.isnan(_edges_on_lines(depth, place, across, depth_m)).all()
+
+
+def test_the_first_scan_does_not_compile(model: BodyModel, body: np.ndarray) -> None:
+    """Depths that were a column of an array are another type to the compiler."""
+    warm_up()
+    contour_places(model, _views(model, body), POSES, body)
+    assert len(_edges_on_lines.signatures) == 1
