@@ -31,6 +31,14 @@ class Attachments:
     weights: Array
     """(n, 3): barycentric, of the triangle's corners."""
 
+    @classmethod
+    def joined(cls, *places: Attachments) -> Attachments:
+        """All places of several sets."""
+        return cls(
+            np.concatenate([one.triangle for one in places]),
+            np.concatenate([one.weights for one in places]),
+        )
+
     def of(self, values: Array, faces: Faces) -> Array:
         """(n, k): values (P, k) of the vertices, interpolated."""
         return np.asarray(interpolated(values, faces, self.triangle, self.weights))

@@ -87,12 +87,8 @@ class ContourPlaces:
     @classmethod
     def joined(cls, pieces: Sequence[ContourPlaces]) -> ContourPlaces:
         """All places of several sets."""
-        places = Attachments(
-            np.concatenate([one.at.triangle for one in pieces]),
-            np.concatenate([one.at.weights for one in pieces]),
-        )
         return cls(
-            places,
+            Attachments.joined(*(one.at for one in pieces)),
             np.concatenate([one.outwards for one in pieces]),
             np.concatenate([one.beyond_px for one in pieces]),
             np.concatenate([one.pixel_m for one in pieces]),

@@ -43,12 +43,8 @@ class OffsetRows:
     @classmethod
     def joined(cls, *rows: OffsetRows) -> OffsetRows:
         """All rows of several sets."""
-        places = Attachments(
-            np.concatenate([one.at.triangle for one in rows]),
-            np.concatenate([one.at.weights for one in rows]),
-        )
         return cls(
-            places,
+            Attachments.joined(*(one.at for one in rows)),
             np.concatenate([one.direction for one in rows]),
             np.concatenate([one.residual_m for one in rows]),
             np.concatenate([one.weight for one in rows]),
