@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 _MODEL_SIGMA_M = 0.003
 """Standard deviation of what shape and pose cannot express. Neighbouring rows share it, which is
 why a row counts less than once."""
+_NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 _SUBSET_POINTS = 10_000
 """Points that are paired with their nearest vertex."""
 _COARSE_EVERY = 4
@@ -187,7 +189,8 @@ def data_terms(
         # skin: by a millimetre and more, on all sides.
         places = attached(model, skin.positions, on_cloud, place)
         on_body, direction = places.of(skin.positions, model.faces), cloud.normals[point]
-    rows = [_point_rows(place, direction, on_cloud - on_body, target.sigma_m[point], annealing)]
+    offset, usual_m = on_cloud - on_body, annealing.usual_mismatch_m
+    rows = [_point_rows(place, direction, offset, target.sigma_m[point], annealing, usual_m)]
     camera_terms = None
     if not annealing.coarse:
         if len(cameras):
@@ -219,9 +222,14 @@ def _point_rows(
     offset: Array,
     sigma_m: Array,
     annealing: AnnealingStep,
+    usual_mismatch_m: float = np.inf,
 ) -> Rows:
     """Robustly weighted rows (Geman & McClure) for offsets (n, 3) along directions (n, 3)."""
     residual = np.einsum("ni,ni->n", direction, offset)
     robust = 1.0 / (1.0 + (residual / annealing.scale_m) ** 2) ** 2
     variance = sigma_m**2 + _MODEL_SIGMA_M**2
-    return Rows(place, direction, residual, annealing.row_share * robust / variance)
+    share = annealing.row_share
+    if len(residual) and np.isfinite(usual_mismatch_m):
+        mismatch_m = _NORMAL_MAD * float(np.median(np.abs(residual)))
+        share *= usual_mismatch_m / max(mismatch_m, usual_mismatch_m)
+    return Rows(place, direction, residual, share * robust / variance)
