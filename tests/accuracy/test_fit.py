@@ -11,6 +11,7 @@ import open3d as o3d
 import pytest
 
 from station.core.bundle import read_bundle
+from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from station.simulation.scene import Mesh, load_mesh
 from station.simulation.sensor import render_bundle
@@ -105,6 +106,19 @@ def test_the_mesh_is_the_same_whatever_the_thread_count(bundle: Path, tmp_path: 
         )
         meshes.append((out / "mesh.ply").read_bytes())
     assert meshes[0] == meshes[1]
+
+
+def test_an_error_beside_the_fit_is_not_lost(
+    model: BodyModel, bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Patches are searched in a thread of their own."""
+
+    def broken(*_: object) -> None:
+        raise InputError("no patches")
+
+    monkeypatch.setattr("workers.scape.fit.fit.unmatched_patches", broken)
+    with pytest.raises(InputError, match="no patches"):
+        fit_body(model, preprocess(read_bundle(bundle)))
 
 
 @pytest.mark.parametrize("turn_deg", [180.0, -80.0])
