@@ -56,6 +56,8 @@ MIDDLE = tuple(
     for _ in range(3)
 )
 FINE = tuple(
-    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2, _USUAL_MISMATCH_M)
+    AnnealingStep(
+        FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2, _USUAL_MISMATCH_M
+    )
     for _ in range(3)
 )
