@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.evidence.free_space import FreeSpace
 from workers.scape.model.body_model import BodyModel
 
@@ -99,20 +100,22 @@ class CameraTerms:
     def build(
         cls,
         rows: Rows,
-        derivative: Array,
+        points: Array,
         camera: NDArray[np.integer],
-        cameras: int,
+        corrections: CameraCorrections,
         skin: Skin,
         count: int,
     ) -> CameraTerms:
         """Sum up rows (n,).
 
         Args:
-            derivative: (n, 6), of each row's residual by the correction of its camera.
-            camera: (n,), index of that camera.
-            cameras: C.
+            points: (n, 3), the corrected point of each row.
+            camera: (n,), index of its camera.
+            corrections: of C cameras.
             count: number of samples.
         """
+        cameras = len(corrections)
+        derivative = corrections.derivative(points, camera, rows.direction)
         normal = np.zeros((6 * cameras, 6 * cameras))
         gradient = np.zeros(6 * cameras)
         cell = skin.sample[rows.place] * cameras + camera

@@ -9,8 +9,9 @@ and x is one of them, n its normal.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -92,21 +93,25 @@ def fit_jointly(
         np.concatenate([target.tree.normals[subset], target.rims.normals]),
     )
     terms: DataTerms | None = None
-    evidence: CameraEvidence | None = None
-    # Terms that do not depend on each other are computed in two threads.
-    with ThreadPoolExecutor(max_workers=2) as beside:
+    evidence: Callable[[], CameraEvidence] | None = None
+    # What does not depend on each other is computed in two threads.
+    with ThreadPoolExecutor(max_workers=1) as beside:
         for step, annealing in enumerate(schedule):
             samples = sampling.body.first(annealing.samples)
             derivative = beside.submit(samples.jacobian, state, annealing.components)
             skin = (sampling.coarse_skin if annealing.coarse else sampling.skin)(model, state)
-            probed = beside.submit(probed_places, model, target, skin, annealing)
+            probe = partial(probed_places, model, target, skin, annealing)
+            # Behind the derivative of many samples, probes would come too late.
+            probed = beside.submit(probe).result if annealing.coarse else probe
             bounds = beside.submit(bound_rows, model, target, cameras, skin, annealing)
-            terms = data_terms(model, target, tracked, probed, bounds, cameras, skin, annealing)
+            terms = data_terms(
+                model, target, tracked, probed, bounds, cameras, skin, annealing, beside
+            )
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
             state, cameras, evidence = _step(
-                model, state, cameras, derivative.result()[1], terms, prior
+                model, state, cameras, derivative.result()[1], terms, prior, beside
             )
             progress((step + 1) / len(schedule))
     assert terms is not None
@@ -116,7 +121,7 @@ def fit_jointly(
         model.vertices(state),
         len(terms.on_body),
         len(schedule),
-        evidence,
+        None if evidence is None else evidence(),
     )
 
 
@@ -127,13 +132,15 @@ def _step(
     derivative: Array32,
     terms: DataTerms,
     prior: TwistPrior,
-) -> tuple[BodyState, CameraCorrections, CameraEvidence | None]:
-    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and what its rows say
-    of the cameras."""
+    beside: ThreadPoolExecutor,
+) -> tuple[BodyState, CameraCorrections, Callable[[], CameraEvidence] | None]:
+    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and what gives its
+    rows' evidence about the cameras."""
     size = derivative.shape[2]
     shape = shape_parameters(model, size - 3 * model.part_count - 3)
     rows = derivative.reshape(-1, size)
-    extra = 0 if terms.cameras is None else len(terms.cameras.gradient)
+    coupling = None if terms.cameras is None else beside.submit(_coupling, rows, terms.cameras)
+    extra = cameras.xi.size if coupling else 0
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
     # The weights are split between both sides: numpy then computes one triangle of the product.
     slack = _WEIGHT_SLACK * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + _MIN_WEIGHT
@@ -145,19 +152,26 @@ def _step(
     prior.add(model, state, normal, gradient)
     body_only = np.arange(size)
     normal[body_only, body_only] += DAMPING * np.trace(normal) / size
-    if terms.cameras is not None:
+    evidence: Callable[[], CameraEvidence] | None = None
+    if coupling:
+        of_cameras, together = coupling.result()
         information = scipy.linalg.block_diag(*cameras.prior_information()) / _CAMERA_SHARE
-        normal[size:, size:] = terms.cameras.normal + information
-        gradient[size:] = terms.cameras.gradient - information @ cameras.xi.ravel()
-        together = rows.T @ terms.cameras.cross.reshape(-1, extra).astype(np.float32)
+        normal[size:, size:] = of_cameras.normal + information
+        gradient[size:] = of_cameras.gradient - information @ cameras.xi.ravel()
         normal[:size, size:] = -together
         normal[size:, :size] = -together.T
+        evidence = partial(_evidence, normal, gradient, of_cameras, cameras)
     delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
-    evidence = None
-    if terms.cameras is not None:
-        evidence = _evidence(normal, gradient, terms.cameras, cameras)
+    if coupling:
         cameras = cameras.updated(delta[size:].reshape(-1, 6))
     return updated(state, delta, shape), cameras, evidence
+
+
+def _coupling(rows: Array32, terms: Future[CameraTerms]) -> tuple[CameraTerms, Array32]:
+    """The cameras' terms, and the samples' derivative (3 n, D) times that by the corrections."""
+    cross = terms.result().cross
+    together = rows.T @ cross.reshape(len(rows), -1).astype(np.float32)
+    return terms.result(), together
 
 
 def _evidence(

@@ -6,8 +6,8 @@ weighted residual before they are multiplied by it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +96,7 @@ class DataTerms:
     """(n, 3, 3), sum of w d d^T over the rows of each sample."""
     residual: Array
     """(n, 3), sum of w r d."""
-    cameras: CameraTerms | None
+    cameras: Future[CameraTerms] | None
     """None while the corrections are kept fixed."""
     on_body: Array
     """(m, 3), places of the skin in the correspondences."""
@@ -152,18 +152,20 @@ def data_terms(
     model: BodyModel,
     target: Target,
     tracked: TrackedPoints,
-    probed: Future[tuple[NDArray[np.intp], NDArray[np.intp]]],
+    probed: Callable[[], tuple[NDArray[np.intp], NDArray[np.intp]]],
     bounds: Future[tuple[Rows, ...]],
     cameras: CameraCorrections,
     skin: Skin,
     annealing: AnnealingStep,
+    beside: ThreadPoolExecutor,
 ) -> DataTerms:
     """Correspondences and bounds, summed up at the samples.
 
     Args:
         tracked: the target's subset of points, followed by its rims.
-        probed: result of `probed_places`.
+        probed: gives the result of `probed_places`.
         bounds: result of `bound_rows`.
+        beside: sums up what involves the cameras.
     """
     cloud = target.tree
     if annealing.coarse:
@@ -177,7 +179,7 @@ def data_terms(
         border = int(np.searchsorted(paired, len(subset)))
         rimmed, at_rims = paired[border:] - len(subset), mine[border:]
         paired, mine = paired[:border], mine[:border]
-    probes, found = probed.result()
+    probes, found = probed()
     place = np.concatenate([mine, probes])
     point = np.concatenate([subset[paired], found])
     camera = target.camera[point]
@@ -194,9 +196,8 @@ def data_terms(
     camera_terms = None
     if not annealing.coarse:
         if len(cameras):
-            derivative = cameras.derivative(on_cloud, camera, direction)
-            camera_terms = CameraTerms.build(
-                rows[0], derivative, camera, len(cameras), skin, annealing.samples
+            camera_terms = beside.submit(
+                CameraTerms.build, rows[0], on_cloud, camera, cameras, skin, annealing.samples
             )
         rows.append(_rim_rows(target.rims, rimmed, cameras, skin, at_rims, annealing))
     weight, residual = Rows.joined(*rows, *bounds.result()).at_samples(skin, annealing.samples)
