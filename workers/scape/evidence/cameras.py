@@ -90,14 +90,17 @@ class CameraCorrections:
 
     def shifts_m(self, cloud: PointCloud) -> dict[str, float]:
         """Distance by which the corrections move the centroid of each camera's points."""
-        found = {}
-        for index, name in enumerate(cloud.camera_names[: len(self)]):
-            mine = cloud.points[cloud.camera == index]
-            if len(mine):
-                middle = mine.mean(axis=0)[None]
-                corrected = self.apply(middle, np.full(1, index, cloud.camera.dtype))
-                found[name] = float(np.linalg.norm(corrected - middle))
-        return found
+        if not len(self):
+            return {}
+        counts = np.bincount(cloud.camera, minlength=len(self))
+        seeing = np.flatnonzero(counts).astype(cloud.camera.dtype)
+        sums = [np.bincount(cloud.camera, along, len(self)) for along in cloud.points.T]
+        middles = np.stack(sums, axis=1)[seeing] / counts[seeing, None]
+        shifts = self.apply(middles, seeing) - middles
+        return {
+            cloud.camera_names[index]: float(np.linalg.norm(shift))
+            for index, shift in zip(seeing, shifts, strict=True)
+        }
 
     def derivative(self, points: Array, camera: Index, directions: Array) -> Array:
         """Derivatives (n, 6) of the points' positions along directions by their cameras' xi."""
