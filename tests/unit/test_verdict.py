@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
-from workers.scape.evidence.inside import share_inside
+from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.posture import arms_inside, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
 from workers.scape.fit.verdict import PartReport, judge, lost_parts
@@ -92,7 +92,7 @@ def test_a_hand_alone_in_the_trunk_is_an_arm_that_was_not_found(model: BodyModel
     twists[model.part_names.index("forearm_right")] = (0.0, 0.0, np.radians(90.0))
     state = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
     vertices = model.vertices(state)
-    assert share_inside(model, vertices, ["forearm_right"]) < 0.3
+    assert shares_inside(model, vertices, [["forearm_right"]])[0] < 0.3
     verdict = _verdict(model, {"": "80 cm2 of the scan"}, {}, arms_inside(model, vertices))
     # What lies beside the body may be the arm itself.
     assert verdict.reasons == (

@@ -17,16 +17,27 @@ _DEEP_M = 0.004
 _AROUND = ("pelvis", "abdomen", "chest", "neck", "head", "thigh_left", "thigh_right")
 
 
-def share_inside(model: BodyModel, vertices: Array, parts: Sequence[str]) -> float:
-    """Share of some parts' vertices that lie 4 mm or more below the skin of trunk, head and thighs.
+def shares_inside(
+    model: BodyModel, vertices: Array, groups: Sequence[Sequence[str]]
+) -> list[float]:
+    """Shares of the vertices of groups of parts that lie 4 mm or more below the skin of trunk, head
+    and thighs.
 
     Args:
         vertices: (P, 3), metres, before crossings are mended.
     """
-    names = np.array(model.part_names)[model.part_of_vertex]
-    around = np.isin(names, _AROUND)
+    around = _of_parts(model, _AROUND)
     skin, normals = vertices[around], vertex_normals(vertices, model.faces)[around]
-    places = vertices[np.isin(names, parts)]
-    nearest = cKDTree(skin).query(places)[1]
-    depth = -np.einsum("ij,ij->i", places - skin[nearest], normals[nearest])
-    return float(np.mean(depth > _DEEP_M))
+    tree = cKDTree(skin, balanced_tree=False)
+    shares = []
+    for parts in groups:
+        places = vertices[_of_parts(model, parts)]
+        nearest = tree.query(places)[1]
+        depth = -np.einsum("ij,ij->i", places - skin[nearest], normals[nearest])
+        shares.append(float(np.mean(depth > _DEEP_M)))
+    return shares
+
+
+def _of_parts(model: BodyModel, parts: Sequence[str]) -> NDArray[np.bool_]:
+    """Mask (P,) of some parts' vertices."""
+    return np.isin(model.part_of_vertex, [model.part_names.index(part) for part in parts])

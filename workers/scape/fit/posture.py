@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from station.core.geometry import so3_log
 from workers.cloud.observed import Finding
-from workers.scape.evidence.inside import share_inside
+from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.verdict import part_in_words
 from workers.scape.model.body_model import HAND, BodyModel
 
@@ -31,13 +31,14 @@ def arms_inside(model: BodyModel, vertices: Array) -> dict[str, str]:
     Args:
         vertices: (P, 3), the fitted surface before crossings are mended.
     """
-    reasons = {}
-    for side in ("left", "right"):
-        forearm, hand = f"forearm_{side}", [f"{part}_{side}" for part in HAND]
-        if any(share_inside(model, vertices, parts) > _INSIDE for parts in ([forearm], hand)):
-            words = part_in_words(forearm)
-            reasons[forearm] = f"the {words} was not found: hold both arms away from the body"
-    return reasons
+    forearms = ["forearm_left", "forearm_right"]
+    hands = [[f"{part}_{side}" for part in HAND] for side in ("left", "right")]
+    shares = shares_inside(model, vertices, [*([forearm] for forearm in forearms), *hands])
+    return {
+        forearm: f"the {part_in_words(forearm)} was not found: hold both arms away from the body"
+        for forearm, *inside in zip(forearms, shares[:2], shares[2:], strict=True)
+        if max(inside) > _INSIDE
+    }
 
 
 def head_turned(model: BodyModel, rotations: Array) -> dict[str, str]:
