@@ -21,6 +21,7 @@ from workers.scape.surface.crossings import crossing_pairs
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Pairs = NDArray[np.int32]
 
 _ARM = ("upper_arm", "forearm", *HAND)
 _ROUNDS = 12
@@ -44,28 +45,28 @@ _FOLLOWING = 0.8
 _SWEEPS = 8
 
 
-def parted(model: BodyModel, vertices: Array, measured: Mask) -> Array:
+def parted(model: BodyModel, vertices: Array, measured: Mask, crossing: Pairs) -> Array:
     """Surface (P, 3) whose arms lie beside the body instead of in it, where that can be done.
 
     Args:
         vertices: (P, 3), metres.
         measured: (P,), vertices of triangles with readings on them.
+        crossing: pairs (m, 2) of triangles that cross.
     """
-    current = vertices
-    for holding in (_HOLDING_ROUNDS, 0):
-        pushed = _pushed(model, current, measured, holding)
-        if pushed is current:
-            break  # nothing crosses
-        current = pushed
-    return current
+    once = _pushed(model, vertices, measured, crossing, _HOLDING_ROUNDS)
+    if once is vertices:
+        return vertices  # nothing crosses
+    of_arms = np.asarray(_arms(model)[model.faces[:, 0]] > 0)
+    left = crossing_pairs(once, model.faces, of_arms)
+    return _pushed(model, once, measured, left, 0)
 
 
-def _pushed(model: BodyModel, vertices: Array, measured: Mask, holding: int) -> Array:
+def _pushed(model: BodyModel, vertices: Array, measured: Mask, pairs: Pairs, holding: int) -> Array:
     """Surface (P, 3) without the contacts that can be parted if measured skin (P,) is held for so
     many rounds."""
     yields = np.where(measured, 0.0, 1.0)
     arm, linked = _arms(model), neighbour_mean(model)
-    first = crossing = _contacts(model, vertices, arm, arm[model.faces[:, 0]] > 0)
+    first = crossing = _contacts(model, pairs)
     current = vertices
     for round_ in range(_ROUNDS):
         if not crossing.any():
@@ -82,16 +83,16 @@ def _pushed(model: BodyModel, vertices: Array, measured: Mask, holding: int) -> 
             motion[follows] = _FOLLOWING * (linked[follows] @ motion)
         current = current + motion
         moved: Mask = np.asarray(motion.any(axis=1))
-        crossing = _contacts(model, current, arm, np.asarray(moved[model.faces].any(axis=1)))
+        tested = np.asarray(moved[model.faces].any(axis=1))
+        crossing = _contacts(model, crossing_pairs(current, model.faces, tested))
     return _without_vain(vertices, current, first, crossing, linked)
 
 
-def _contacts(model: BodyModel, vertices: Array, arm: NDArray[np.intp], tested: Mask) -> Mask:
-    """Mask (P,) of corners of triangles of an arm that cross others, and of these; one of both is
-    among those to be tested (K,)."""
-    pairs = crossing_pairs(vertices, model.faces, tested)
+def _contacts(model: BodyModel, pairs: Pairs) -> Mask:
+    """Mask (P,) of the corners of crossing triangles (m, 2), one of which is of an arm."""
+    arm = _arms(model)
     one, other = (arm[model.faces[pairs[:, side], 0]] for side in (0, 1))
-    corners = np.zeros(len(vertices), bool)
+    corners = np.zeros(model.vertex_count, bool)
     corners[model.faces[pairs[one != other]]] = True
     return corners
 

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, area_vectors, vertex_normals
-from workers.scape.surface.contacts import grown, neighbour_mean, parted
+from workers.scape.surface.contacts import Pairs, grown, neighbour_mean, parted
 from workers.scape.surface.crossings import crossing_pairs
 
 Array = NDArray[np.float64]
@@ -76,17 +76,19 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
     """
     faces = model.faces
     mean = neighbour_mean(model)
-    current = first = parted(model, vertices, measured)
+    crossing = crossing_pairs(vertices, faces)
+    current = first = parted(model, vertices, measured, crossing)
+    if current is not vertices:
+        crossing = crossing_pairs(current, faces)
     # What was parted keeps its offset from a model that was parted as well.
     relaxed_to = reference + (current - vertices)
     trouble = np.zeros(len(vertices), np.int64)
-    tested: Mask = np.ones(len(faces), bool)
     given_up: Mask = np.zeros(len(faces), bool)
     held = measured
     for round_ in range(_MAX_ROUNDS):
         if round_ == _HOLDING_ROUNDS:
             held, trouble = np.zeros_like(measured), np.zeros_like(trouble)
-        bad = _bad(current, reference, faces, tested) & ~given_up
+        bad = _bad(current, reference, faces, crossing) & ~given_up
         if round_ == _OFFSET_ROUNDS:
             given_up = bad & _in_large_patches(faces, bad, mean)
             bad &= ~given_up
@@ -103,19 +105,19 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
         current = relaxed
         changed = np.zeros(len(vertices), bool)
         changed[patch] = changed[yielding] = True
-        tested = np.asarray(changed[faces].any(axis=1))
+        crossing = crossing_pairs(current, faces, np.asarray(changed[faces].any(axis=1)))
     else:
-        bad = _bad(current, reference, faces, tested)
+        bad = _bad(current, reference, faces, crossing)
     farthest_m = np.where(measured, _MEASURED_YIELDS_M, _DEEPEST_M)
     spoiled = np.linalg.norm(current - first, axis=1) > farthest_m
     spoiled[faces[bad | given_up]] = True
     return _restored(current, first, np.flatnonzero(spoiled), mean)
 
 
-def _bad(vertices: Array, reference: Array, faces: Faces, tested: Mask) -> Mask:
-    """Mask (K,) of flipped triangles, and of those that cross another where one is `tested`."""
+def _bad(vertices: Array, reference: Array, faces: Faces, crossing: Pairs) -> Mask:
+    """Mask (K,) of flipped triangles, and of those in pairs (m, 2) that cross."""
     bad = turned_over(vertices, reference, faces)
-    bad[crossing_pairs(vertices, faces, tested).ravel()] = True
+    bad[crossing.ravel()] = True
     return bad
 
 
