@@ -42,7 +42,8 @@ class SeenSkin:
         """Skin of a body (P, 3) of which cameras saw some vertices (P,)."""
         known = seen.astype(np.float64)
         degree = np.asarray(model.adjacency.sum(axis=1)).ravel()
-        return cls(vertices, (known + model.adjacency @ known) / (1.0 + degree), cKDTree(vertices))
+        share = (known + model.adjacency @ known) / (1.0 + degree)
+        return cls(vertices, share, cKDTree(vertices, balanced_tree=False))
 
     def seen_along(self, trace: Trace) -> float:
         """Share of a row's line that cameras saw, by length; of its ends where only these count.

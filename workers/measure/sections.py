@@ -112,13 +112,19 @@ def _connected(tails, heads, count):  # type: ignore[no-untyped-def]  # pragma: 
     return root
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Vector product (3,) of two vectors, which takes numpy ten times as long."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
+
+
 def plane_axes(normal: Array, along: Array | None = None) -> tuple[Array, Array]:
     """Two unit vectors in a plane, the first the projection of `along`."""
     if along is None:
         along = np.array((0.0, 1.0, 0.0) if abs(normal[1]) < 0.9 else (1.0, 0.0, 0.0))
     x = along - normal * (along @ normal)
     x = x / np.linalg.norm(x)
-    return x, np.cross(normal, x)
+    return x, cross(normal, x)
 
 
 def hull_order(points: Array, normal: Array) -> Index:

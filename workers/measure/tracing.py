@@ -35,6 +35,7 @@ from workers.measure.sections import (
     EdgeNet,
     EdgePoints,
     Index,
+    cross,
     encloses,
     hull_order,
     loop_length,
@@ -42,6 +43,7 @@ from workers.measure.sections import (
     surface_order,
 )
 from workers.scape.model.body_model import BodyModel
+from workers.scape.model.deformation import area_vectors
 
 Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -126,7 +128,8 @@ class _Tracer:
         self._vertices = vertices
         corners = vertices[model.faces]
         self._middles = corners.mean(axis=1)
-        self._crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._crosses = area_vectors(vertices, model.faces)
+        self._patches: dict[tuple[str, ...], tuple[Array, Array]] = {}
         self._cuts: dict[Section, _Tape] = {}
         self.missed: list[str] = []
         """Rows whose planes missed what they should cut, and why."""
@@ -187,9 +190,7 @@ class _Tracer:
                 point = self._at(start) + along / length * line if at is None else self._at(at)
                 return point, line / length
             case Tilted(front, back, side, other):
-                normal = np.cross(
-                    self._at(other) - self._at(side), self._at(back) - self._at(front)
-                )
+                normal = cross(self._at(other) - self._at(side), self._at(back) - self._at(front))
                 return self._at(front), normal / np.linalg.norm(normal)
             case Protrusion():
                 return self._farthest(plane), _UP
@@ -211,9 +212,9 @@ class _Tracer:
 
     def _narrowest(self, section: Section, plane: Narrowest) -> _Tape:
         across = self._at(plane.other_side) - self._at(plane.side)
-        ahead = np.cross(across, _UP)
+        ahead = cross(across, _UP)
         ahead /= np.linalg.norm(ahead)
-        up = np.cross(ahead, across)
+        up = cross(ahead, across)
         up /= np.linalg.norm(up)
         front = self._at(plane.front)
         middle = 0.5 * (front + self._at(plane.back))
@@ -308,7 +309,7 @@ class _Tracer:
             outward = 0.5 * (ends[0] + ends[1]) - self._mean(route.landmarks)
         else:
             outward = self._facing(route, ends[0]) + self._facing(route, ends[1])
-        normal = np.cross(ends[1] - ends[0], outward)
+        normal = cross(ends[1] - ends[0], outward)
         normal /= np.linalg.norm(normal)
         net = _net(self._model, route.parts)
         found, crossing = net.cut(self._vertices, ends[0], normal)
@@ -324,9 +325,16 @@ class _Tracer:
 
     def _facing(self, route: Route, end: Array) -> Array:
         """Unit normal of the skin around an end of a leg."""
-        triangles = _triangles(self._model, route.parts)
+        middles, crosses = self._patch(route.parts)
         neck, crotch = (self._at(landmark) for landmark in TRUNK_ENDS)
-        away = (self._middles[triangles] - end) / (NORMAL_RADIUS * np.linalg.norm(neck - crotch))
+        away = (middles - end) / (NORMAL_RADIUS * np.linalg.norm(neck - crotch))
         weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away))
-        total = weight @ self._crosses[triangles]
+        total = weight @ crosses
         return np.asarray(total / np.linalg.norm(total))
+
+    def _patch(self, parts: tuple[str, ...]) -> tuple[Array, Array]:
+        """Middles and normals (k, 3) of the triangles of some parts; kept for other rows."""
+        if parts not in self._patches:
+            triangles = _triangles(self._model, parts)
+            self._patches[parts] = self._middles[triangles], self._crosses[triangles]
+        return self._patches[parts]

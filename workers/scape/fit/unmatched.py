@@ -63,7 +63,7 @@ def unmatched_patches(model: BodyModel, vertices: Array, cloud: PointCloud) -> t
     cell = np.flatnonzero(first >= 0)
     chosen = first[cell]
     points = cloud.points[chosen]
-    _, near = cKDTree(vertices).query(points)
+    _, near = cKDTree(vertices, balanced_tree=False).query(points)
     places = attached(model, vertices, points, near)
     away = np.linalg.norm(points - places.of(vertices, model.faces), axis=1)
     far = np.flatnonzero(away > FAR_M)
