@@ -62,10 +62,10 @@ def _average(stack, scale, least, third, depth, count, unsettled, change):  # ty
     frames, height, width = stack.shape
     ordered = np.empty((frames, width), np.uint16)
     read = np.empty(width, np.uint16)
-    median, gate = np.empty((2, width), np.float32)
-    # Separate names: the compiler does not vectorise rows that are addressed by an index.
-    total, early, late = np.empty((3, width), np.float32)
-    kept, kept_early, kept_late = np.empty((3, width), np.uint16)
+    # Separate arrays: the compiler does not vectorise rows of one, which might overlap.
+    median, gate = np.empty(width, np.float32), np.empty(width, np.float32)
+    total, early, late = np.empty_like(median), np.empty_like(median), np.empty_like(median)
+    kept, kept_early, kept_late = np.empty_like(read), np.empty_like(read), np.empty_like(read)
     for y in range(height):
         _sort(stack, y, ordered, read)
         for x in range(width):

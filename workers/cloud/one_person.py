@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -45,12 +46,7 @@ def one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     everything = np.concatenate(points)
     if len(everything) < LEAST_READINGS:
         raise InputError(NOBODY)
-    # One coordinate per row: minima along long rows are fast.
-    rows = everything.T.copy()
-    low = rows.min(axis=1, keepdims=True) - 2 * _VOXEL_M
-    cells = ((rows - low) / _VOXEL_M).astype(np.int64)
-    shape = tuple(cells.max(axis=1) + 3)
-    cell = np.ravel_multi_index(tuple(cells), shape)
+    cell, shape = cells_of(everything, _VOXEL_M)
     occupied = np.bincount(cell, minlength=np.prod(shape)).reshape(shape)
     labels, count = ndimage.label(ndimage.binary_dilation(occupied >= _MIN_READINGS_PER_CELL))
     of_point = labels.ravel()[cell]
@@ -70,6 +66,23 @@ def one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
         findings.append(Finding("two-people", None, None, message))
     ends = np.cumsum([len(part) for part in points])
     return np.split(keep, ends[:-1]), findings
+
+
+@numba.njit(cache=True, nogil=True)
+def cells_of(points, size_m):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Index (n,) of each point's cell in a grid, and the grid's shape; its border is empty."""
+    low, high = points[0].copy(), points[0].copy()
+    for p in range(len(points)):
+        for i in range(3):
+            low[i], high[i] = min(low[i], points[p, i]), max(high[i], points[p, i])
+    low -= 2.0 * size_m
+    x, y, z = ((high - low) / size_m).astype(np.int64) + 3
+    cell = np.empty(len(points), np.int64)
+    for p in range(len(points)):
+        cell[p] = 0
+        for i, cells in enumerate((x, y, z)):
+            cell[p] = cell[p] * cells + int((points[p, i] - low[i]) / size_m)
+    return cell, (x, y, z)
 
 
 def _pieces_of_body(labels: NDArray[np.int32], sizes: NDArray[np.int64], main: int) -> Mask:

@@ -18,7 +18,7 @@ from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m
 from workers.cloud.observed import CameraView, Finding, PointCloud, Preprocessed
-from workers.cloud.one_person import one_person
+from workers.cloud.one_person import cells_of, one_person
 from workers.cloud.points import normals, within
 
 Array = NDArray[np.float64]
@@ -60,6 +60,7 @@ def warm_up() -> None:
     nothing.flags.writeable = False
     within(nothing, np.zeros((1, 1), np.float32), np.eye(4), np.zeros(3), np.zeros(3))
     normals(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32))
+    cells_of(np.zeros((1, 3)), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
