@@ -15,6 +15,7 @@ did. Rounds narrow the gate and weaken the prior.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -210,26 +211,33 @@ def fit_surface(
     offset = np.zeros_like(vertices)
     before: _AtVertices | None = None
     sides_px: Array | None = None
-    for round_ in _ROUNDS:
-        current = vertices + offset
-        used, vertex, places = readings.placed(
-            model, current, round_.angle_rad, gate_m=round_.gate_m
-        )
-        away = readings.away_m(used, places.of(vertices, model.faces))
-        rows = [
-            OffsetRows(places, readings.directions[used], away, readings.information[used]),
-            _crown_rows(model, crown_rows(model, views, poses, current), offset),
-        ]
-        if before is None:
-            before = readings.at_vertices(used, vertex, away, len(vertices))
-            sigma_m = _offset_sigma_m(model, before, readings.noise_m)
-        elif views:
-            contours = contour_places(model, views, poses, current)
-            if sides_px is None:
-                sides_px = side_offsets_px(contours, len(views))
-            rows.append(contour_rows(model, contours, sides_px, offset))
-        of_round_m = sigma_m / np.sqrt(round_.stiffness)
-        offset = solved(model, prior, of_round_m, OffsetRows.joined(*rows), offset, round_.enough)
+    # Images are searched beside the cloud.
+    with ThreadPoolExecutor(1) as beside:
+        for round_ in _ROUNDS:
+            current = vertices + offset
+            contours = None
+            if views and before is not None:
+                contours = beside.submit(contour_places, model, views, poses, current)
+            crown = beside.submit(crown_rows, model, views, poses, current)
+            used, vertex, places = readings.placed(
+                model, current, round_.angle_rad, gate_m=round_.gate_m
+            )
+            away = readings.away_m(used, places.of(vertices, model.faces))
+            if before is None:
+                before = readings.at_vertices(used, vertex, away, len(vertices))
+                sigma_m = _offset_sigma_m(model, before, readings.noise_m)
+            rows = [
+                OffsetRows(places, readings.directions[used], away, readings.information[used]),
+                _crown_rows(model, crown.result(), offset),
+            ]
+            if contours is not None:
+                found = contours.result()
+                if sides_px is None:
+                    sides_px = side_offsets_px(found, len(views))
+                rows.append(contour_rows(model, found, sides_px, offset))
+            of_round_m = sigma_m / np.sqrt(round_.stiffness)
+            joined = OffsetRows.joined(*rows)
+            offset = solved(model, prior, of_round_m, joined, offset, round_.enough)
     assert before is not None
     return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
 
