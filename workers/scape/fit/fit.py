@@ -308,9 +308,11 @@ def _best_start(
         share = len(schedule) / total
         parts, places = model.part_of_vertex[::_RIM_EVERY], best.vertices[::_RIM_EVERY]
         bodies = [places[np.isin(parts, hand.parts)] for hand in hands]
-        target = replace(target, rims=rims_of(views, cloud.camera_names, bodies))
-        normals = vertex_normals(best.vertices, model.faces)
-        state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)
+        with ThreadPoolExecutor(1) as beside:
+            rims = beside.submit(rims_of, views, cloud.camera_names, bodies)
+            normals = vertex_normals(best.vertices, model.faces)
+            state = place_hands(model, hands, target.tree, best.state, best.vertices, normals)
+            target = replace(target, rims=rims.result())
         best = fit_jointly(
             model,
             sampling,
