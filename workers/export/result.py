@@ -7,6 +7,7 @@ import json
 import math
 import platform
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -74,21 +75,30 @@ def write_result(
         measured: the body as scanned.
         standing: the same body in the standard pose.
     """
-    with watch.step("export"):
-        rows = _shown_rows(measured, fit.verdict)
-        files = {
-            **surface,
-            "mesh.glb": mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin)),
-            "measurements.json": _json(measurements_document(origin, measured, fit.verdict)),
-            STANDARD_POSE_FILE: _json(measurements_document(origin, standing, fit.verdict)),
-            "preview.png": picture,
+    # What is ready is written and hashed while the rest is made.
+    with watch.step("export"), ThreadPoolExecutor(1) as beside:
+        hashes = {
+            name: beside.submit(_stored, folder / name, content)
+            for name, content in surface.items()
         }
-        for name, content in files.items():
-            (folder / name).write_bytes(content)
-    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        drawn = beside.submit(_stored, folder / "preview.png", picture)
+        rows = _shown_rows(measured, fit.verdict)
+        mesh = mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin))
+        hashes["mesh.glb"] = beside.submit(_stored, folder / "mesh.glb", mesh)
+        for name, body in (("measurements.json", measured), (STANDARD_POSE_FILE, standing)):
+            table = _json(measurements_document(origin, body, fit.verdict))
+            hashes[name] = beside.submit(_stored, folder / name, table)
+        hashes["preview.png"] = drawn
     seconds = {**watch.seconds, "total": watch.total_s()}
-    document = result_document(model, fit, origin, method, seconds, hashes)
+    of_files = {name: found.result() for name, found in hashes.items()}
+    document = result_document(model, fit, origin, method, seconds, of_files)
     (folder / "result.json").write_bytes(_json(document))
+
+
+def _stored(path: Path, content: bytes) -> str:
+    """Write a file; returns its SHA-256."""
+    path.write_bytes(content)
+    return hashlib.sha256(content).hexdigest()
 
 
 def _about(fit: FitResult, origin: Origin) -> dict[str, Any]:
