@@ -82,10 +82,10 @@ class CameraCorrections:
     def poses(self, views: Sequence[CameraView]) -> list[Array]:
         """Corrected world_from_camera (4, 4) of the cloud's views."""
         found = []
-        for view, eye, xi in zip(views, self.eyes, self.xi, strict=True):
-            turn = so3_exp(xi[None, :3])[0]
+        places, turns = self.eyes + self.xi[:, 3:], so3_exp(self.xi[:, :3])
+        for view, turn, place in zip(views, turns, places, strict=True):
             pose = view.calibration.world_from_camera
-            found.append(rigid(turn @ pose[:3, :3], eye + xi[3:]))
+            found.append(rigid(turn @ pose[:3, :3], place))
         return found
 
     def shifts_m(self, cloud: PointCloud) -> dict[str, float]:
