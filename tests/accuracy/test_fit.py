@@ -19,6 +19,7 @@ from workers.cloud.cloud_file import _outwards, read_cloud
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import measure_body
+from workers.reconstruct.job import reconstruct_bundle
 from workers.scape.fit.fit import FitResult, fit_body
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
@@ -119,6 +120,16 @@ def test_an_error_beside_the_fit_is_not_lost(
     monkeypatch.setattr("workers.scape.fit.fit.unmatched_patches", broken)
     with pytest.raises(InputError, match="no patches"):
         fit_body(model, preprocess(read_bundle(bundle)))
+
+
+def test_a_file_that_cannot_be_written_leaves_no_result(
+    model: BodyModel, bundle: Path, tmp_path: Path
+) -> None:
+    """Files are written in a thread of their own."""
+    (tmp_path / "mesh.obj").mkdir()
+    with pytest.raises(OSError, match=r"mesh\.obj"):
+        reconstruct_bundle(bundle, tmp_path, model=model)
+    assert not (tmp_path / "result.json").exists()
 
 
 @pytest.mark.parametrize("turn_deg", [180.0, -80.0])

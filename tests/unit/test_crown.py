@@ -150,6 +150,29 @@ def test_a_corrected_camera_stands_where_its_points_are_moved_to(
     assert np.allclose(transform(pose, local), corrections.apply(points, camera), atol=1e-9)
 
 
+def test_shifts_are_those_of_the_middle_of_each_cameras_points(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    """Of three cameras one has no points."""
+    view = _view(model, body)
+    names = ("one", "blind", "other")
+    views = [replace(view, name=name) for name in names]
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (1000, 3))
+    camera = np.repeat(np.array([0, 2], np.int16), 500)
+    cloud = PointCloud(points, points, np.ones(1000), camera, names)
+    xi = np.zeros((3, 6))
+    xi[0, 3:], xi[2, :3] = (0.003, 0.0, 0.004), (0.0, 0.0, 0.01)
+    corrections = CameraCorrections.build(cloud, views).updated(xi)
+    shifts = corrections.shifts_m(cloud)
+    assert set(shifts) == {"one", "other"}
+    assert shifts["one"] == pytest.approx(0.005)
+    middle = points[500:].mean(axis=0)
+    lever = np.linalg.norm((middle - corrections.eyes[2])[:2])
+    assert shifts["other"] == pytest.approx(0.01 * lever, rel=1e-4)
+    bare = PointCloud(points, points, np.ones(1000), camera, ())
+    assert CameraCorrections.build(bare, []).shifts_m(bare) == {}
+
+
 def test_the_surface_rises_to_the_crown_that_no_point_lies_on(
     model: BodyModel, body: np.ndarray
 ) -> None:

@@ -19,6 +19,7 @@ from station.core.rig import CameraCalibration, PredictedError
 from station.simulation.scene import Mesh, box, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
+from workers.cloud.one_person import cells_of
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
 from workers.cloud.preprocess import preprocess
@@ -106,6 +107,18 @@ def test_warming_up_compiles_what_a_scan_calls(monkeypatch: pytest.MonkeyPatch) 
     depth = camera.depth_correction.apply(np.full((camera.height, camera.width), 1.5, np.float32))
     module._in_volume(camera, depth.astype(np.float32), Volume())
     assert called[1] == called[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5000])
+def test_cells_are_those_of_a_grid_with_an_empty_border(count: int) -> None:
+    points = np.random.default_rng(count).uniform(-1.0, 2.0, (count, 3))
+    points[-1] = points.min(axis=0)
+    points[-1] += (0.05, 0.10, 0.0)  # on the border of a cell
+    cell, shape = cells_of(points, 0.05)
+    along = ((points - (points.min(axis=0) - 2 * 0.05)) / 0.05).astype(int)
+    assert (np.stack(np.unravel_index(cell, shape), axis=1) == along).all()
+    assert (along.min(axis=0) >= 1).all()
+    assert (along.max(axis=0) < np.array(shape) - 1).all()
 
 
 def test_projection_inverts_the_rays() -> None:

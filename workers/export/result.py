@@ -31,13 +31,16 @@ STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 
 
-def surface_files(model: BodyModel, fit: FitResult, origin: Origin) -> dict[str, bytes]:
-    """Files that need no measurements, by name."""
+def surface_files(
+    model: BodyModel, fit: FitResult, measured: MeasuredBody, origin: Origin
+) -> dict[str, bytes]:
+    """Files of meshes and points, by name."""
     about, comments = _about(fit, origin), _comments(fit, origin)
-    cloud = fit.cloud
+    cloud, rows = fit.cloud, _shown_rows(measured, fit.verdict)
     return {
         "mesh.ply": ply_mesh(fit.vertices, model.faces, comments),
         "mesh.obj": obj_mesh(fit.vertices, model, comments),
+        "mesh.glb": mesh_glb(fit.vertices, model.faces, rows, about),
         "avatar.glb": avatar_glb(model, fit.vertices, fit.state, about),
         "cloud.ply": ply_cloud(cloud.points, cloud.normals, comments),
     }
@@ -79,16 +82,11 @@ def write_result(
     with watch.step("export"), ThreadPoolExecutor(1) as beside:
         hashes = {
             name: beside.submit(_stored, folder / name, content)
-            for name, content in surface.items()
+            for name, content in {**surface, "preview.png": picture}.items()
         }
-        drawn = beside.submit(_stored, folder / "preview.png", picture)
-        rows = _shown_rows(measured, fit.verdict)
-        mesh = mesh_glb(fit.vertices, model.faces, rows, _about(fit, origin))
-        hashes["mesh.glb"] = beside.submit(_stored, folder / "mesh.glb", mesh)
         for name, body in (("measurements.json", measured), (STANDARD_POSE_FILE, standing)):
             table = _json(measurements_document(origin, body, fit.verdict))
             hashes[name] = beside.submit(_stored, folder / name, table)
-        hashes["preview.png"] = drawn
     seconds = {**watch.seconds, "total": watch.total_s()}
     of_files = {name: found.result() for name, found in hashes.items()}
     document = result_document(model, fit, origin, method, seconds, of_files)

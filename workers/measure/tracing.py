@@ -128,7 +128,7 @@ class _Tracer:
         self._vertices = vertices
         corners = vertices[model.faces]
         self._middles = corners.mean(axis=1)
-        self._crosses = area_vectors(vertices, model.faces)
+        self._area_vectors = area_vectors(vertices, model.faces)
         self._patches: dict[tuple[str, ...], tuple[Array, Array]] = {}
         self._cuts: dict[Section, _Tape] = {}
         self.missed: list[str] = []
@@ -325,16 +325,16 @@ class _Tracer:
 
     def _facing(self, route: Route, end: Array) -> Array:
         """Unit normal of the skin around an end of a leg."""
-        middles, crosses = self._patch(route.parts)
+        middles, areas = self._patch(route.parts)
         neck, crotch = (self._at(landmark) for landmark in TRUNK_ENDS)
         away = (middles - end) / (NORMAL_RADIUS * np.linalg.norm(neck - crotch))
         weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away))
-        total = weight @ crosses
+        total = weight @ areas
         return np.asarray(total / np.linalg.norm(total))
 
     def _patch(self, parts: tuple[str, ...]) -> tuple[Array, Array]:
-        """Middles and normals (k, 3) of the triangles of some parts; kept for other rows."""
+        """Middles and area vectors (k, 3) of the triangles of some parts; kept for other rows."""
         if parts not in self._patches:
             triangles = _triangles(self._model, parts)
-            self._patches[parts] = self._middles[triangles], self._crosses[triangles]
+            self._patches[parts] = self._middles[triangles], self._area_vectors[triangles]
         return self._patches[parts]

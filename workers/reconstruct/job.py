@@ -163,8 +163,8 @@ def _fitted(
             measuring, standing = _measuring(beside, model, overlapping, scan.predicted, watch)
             fit = separate_limbs(model, overlapping, scan.findings, observer)
             watch.seconds.update(fit.seconds)
-            filing = beside.submit(surface_files, model, fit, origin)
             measured = measuring.result()
+            filing = beside.submit(surface_files, model, fit, measured, origin)
             with watch.step("export"):
                 picture = picture_file(model, fit, measured, origin)
             surface = filing.result()

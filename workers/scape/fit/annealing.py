@@ -10,8 +10,10 @@ from workers.scape.fit.sampling import COARSE_SAMPLES, FINE_SAMPLES
 
 _ALL_COMPONENTS = 1 << 20
 """More than any model has."""
-_USUAL_MISMATCH_M = 1.4e-3
-"""Bodies of the model's own family have 1.1 to 1.5 mm, sculpted ones 2.3 to 2.9."""
+_USUAL_SPREAD_M = 0.93e-3
+"""With the points' noise 1.4 mm where ten frames are averaged: bodies of the model's own family
+have 1.1 to 1.5 in the first fine step, sculpted ones 2.3 to 2.9. Of one frame alone 3.3: 2.9 to 3.2
+and 3.6 to 4.0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +33,10 @@ class AnnealingStep:
     row_share: float
     """Share with which a row counts, since neighbouring rows share the model's error. It is low at
     first, so that the prior keeps the face and the hands in shape while they move into place."""
-    usual_mismatch_m: float = np.inf
-    """Mismatch of body and cloud up to which rows count so. Beyond it they count less, by its
-    inverse: a body that the model cannot follow has more error in common among neighbours."""
+    usual_spread_m: float = np.inf
+    """Spread of the points' distances from the body, beyond their noise, up to which rows of points
+    count so. Beyond it they count less, by its inverse: on a body that the model cannot follow
+    neighbours have more error in common."""
 
     @property
     def coarse(self) -> bool:
@@ -56,8 +59,6 @@ MIDDLE = tuple(
     for _ in range(3)
 )
 FINE = tuple(
-    AnnealingStep(
-        FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2, _USUAL_MISMATCH_M
-    )
+    AnnealingStep(FINE_SAMPLES, _ALL_COMPONENTS, 0.03, np.radians(40), 0.006, 1.2, _USUAL_SPREAD_M)
     for _ in range(3)
 )

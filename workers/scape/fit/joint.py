@@ -94,7 +94,7 @@ def fit_jointly(
     )
     terms: DataTerms | None = None
     evidence: Callable[[], CameraEvidence] | None = None
-    # What does not depend on each other is computed in two threads.
+    # Terms that do not depend on each other are computed here and in one thread beside.
     with ThreadPoolExecutor(max_workers=1) as beside:
         for step, annealing in enumerate(schedule):
             samples = sampling.body.first(annealing.samples)
@@ -134,13 +134,13 @@ def _step(
     prior: TwistPrior,
     beside: ThreadPoolExecutor,
 ) -> tuple[BodyState, CameraCorrections, Callable[[], CameraEvidence] | None]:
-    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and what gives its
-    rows' evidence about the cameras."""
+    """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and a function that
+    gives the evidence of its rows about the cameras."""
     size = derivative.shape[2]
     shape = shape_parameters(model, size - 3 * model.part_count - 3)
     rows = derivative.reshape(-1, size)
     coupling = None if terms.cameras is None else beside.submit(_coupling, rows, terms.cameras)
-    extra = cameras.xi.size if coupling else 0
+    extra = 0 if coupling is None else cameras.xi.size
     normal, gradient = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
     # The weights are split between both sides: numpy then computes one triangle of the product.
     slack = _WEIGHT_SLACK * np.trace(terms.weight, axis1=1, axis2=2)[:, None, None] + _MIN_WEIGHT
@@ -153,7 +153,7 @@ def _step(
     body_only = np.arange(size)
     normal[body_only, body_only] += DAMPING * np.trace(normal) / size
     evidence: Callable[[], CameraEvidence] | None = None
-    if coupling:
+    if coupling is not None:
         of_cameras, together = coupling.result()
         information = scipy.linalg.block_diag(*cameras.prior_information()) / _CAMERA_SHARE
         normal[size:, size:] = of_cameras.normal + information
@@ -162,13 +162,16 @@ def _step(
         normal[size:, :size] = -together.T
         evidence = partial(_evidence, normal, gradient, of_cameras, cameras)
     delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
-    if coupling:
+    if coupling is not None:
         cameras = cameras.updated(delta[size:].reshape(-1, 6))
     return updated(state, delta, shape), cameras, evidence
 
 
 def _coupling(rows: Array32, terms: Future[CameraTerms]) -> tuple[CameraTerms, Array32]:
-    """The cameras' terms, and the samples' derivative (3 n, D) times that by the corrections."""
+    """The cameras' terms, and the samples' derivative (3 n, D) times that by the corrections.
+
+    It may wait in the thread that computes the terms, which was given them before.
+    """
     cross = terms.result().cross
     together = rows.T @ cross.reshape(len(rows), -1).astype(np.float32)
     return terms.result(), together

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.robust import spread_of
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
@@ -30,8 +31,8 @@ Array = NDArray[np.float64]
 _MODEL_SIGMA_M = 0.003
 """Standard deviation of what shape and pose cannot express. Neighbouring rows share it, which is
 why a row counts less than once."""
-_NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+_NOISE_LEFT = 0.7
+"""Share of the points' standard deviation that their distances from the body show."""
 _SUBSET_POINTS = 10_000
 """Points that are paired with their nearest vertex."""
 _COARSE_EVERY = 4
@@ -191,8 +192,9 @@ def data_terms(
         # skin: by a millimetre and more, on all sides.
         places = attached(model, skin.positions, on_cloud, place)
         on_body, direction = places.of(skin.positions, model.faces), cloud.normals[point]
-    offset, usual_m = on_cloud - on_body, annealing.usual_mismatch_m
-    rows = [_point_rows(place, direction, offset, target.sigma_m[point], annealing, usual_m)]
+    residual, sigma_m = along(direction, on_cloud - on_body), target.sigma_m[point]
+    share = share_of_points(residual, sigma_m, annealing)
+    rows = [_point_rows(place, direction, residual, sigma_m, annealing.scale_m, share)]
     camera_terms = None
     if not annealing.coarse:
         if len(cameras):
@@ -214,23 +216,34 @@ def _rim_rows(
 ) -> Rows:
     """Rows that place the outlines of hands where cameras saw them end before the background."""
     offset = cameras.apply(rims.points[rimmed], rims.camera[rimmed]) - skin.positions[place]
-    return _point_rows(place, rims.normals[rimmed], offset, rims.sigma_m[rimmed], annealing)
+    direction, sigma_m = rims.normals[rimmed], rims.sigma_m[rimmed]
+    residual = along(direction, offset)
+    return _point_rows(place, direction, residual, sigma_m, annealing.scale_m, annealing.row_share)
+
+
+def along(direction: Array, offset: Array) -> Array:
+    """Offsets (n, 3) along unit directions (n, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", direction, offset))
+
+
+def share_of_points(residual_m: Array, sigma_m: Array, annealing: AnnealingStep) -> float:
+    """Share with which the rows of points count, by their distances (n,) from the body."""
+    if annealing.usual_spread_m == np.inf or not len(residual_m):
+        return annealing.row_share
+    noise_m = _NOISE_LEFT * float(np.sqrt(np.mean(sigma_m**2)))
+    usual_m = float(np.hypot(annealing.usual_spread_m, noise_m))
+    return annealing.row_share * usual_m / max(spread_of(residual_m), usual_m)
 
 
 def _point_rows(
     place: NDArray[np.intp],
     direction: Array,
-    offset: Array,
+    residual_m: Array,
     sigma_m: Array,
-    annealing: AnnealingStep,
-    usual_mismatch_m: float = np.inf,
+    scale_m: float,
+    share: float,
 ) -> Rows:
-    """Robustly weighted rows (Geman & McClure) for offsets (n, 3) along directions (n, 3)."""
-    residual = np.einsum("ni,ni->n", direction, offset)
-    robust = 1.0 / (1.0 + (residual / annealing.scale_m) ** 2) ** 2
+    """Robustly weighted rows (Geman & McClure) for distances (n,) along directions (n, 3)."""
+    robust = 1.0 / (1.0 + (residual_m / scale_m) ** 2) ** 2
     variance = sigma_m**2 + _MODEL_SIGMA_M**2
-    share = annealing.row_share
-    if len(residual) and np.isfinite(usual_mismatch_m):
-        mismatch_m = _NORMAL_MAD * float(np.median(np.abs(residual)))
-        share *= usual_mismatch_m / max(mismatch_m, usual_mismatch_m)
-    return Rows(place, direction, residual, share * robust / variance)
+    return Rows(place, direction, residual_m, share * robust / variance)

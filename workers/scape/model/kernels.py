@@ -141,7 +141,7 @@ def trimmed_costs(tried, cloud, cloud_cut, tried_cut, tried_share):  # type: ign
     return result
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def area_vectors(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Normals (K, 3) of triangles, of twice their areas' length."""
     out = np.empty((len(faces), 3))
@@ -163,7 +163,7 @@ def area_vectors(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def summed_at_corners(values, faces, count):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Sums (count, 3) at the vertices of the values (K, 3) of the triangles around them."""
     out = np.zeros((count, 3))
@@ -175,7 +175,7 @@ def summed_at_corners(values, faces, count):  # type: ignore[no-untyped-def]  # 
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def edge_sums(vertices, faces, matrices, weights):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Sums (P, 3) at the vertices of the edges that end there minus those that start there.
 

@@ -89,7 +89,7 @@ def _pushed(model: BodyModel, vertices: Array, measured: Mask, pairs: Pairs, hol
 
 
 def _contacts(model: BodyModel, pairs: Pairs) -> Mask:
-    """Mask (P,) of the corners of crossing triangles (m, 2), one of which is of an arm."""
+    """Mask (P,) of the corners of crossing triangles (m, 2) of both arms or of one and the rest."""
     arm = _arms(model)
     one, other = (arm[model.faces[pairs[:, side], 0]] for side in (0, 1))
     corners = np.zeros(model.vertex_count, bool)

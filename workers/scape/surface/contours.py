@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from station.core.geometry import invert, transform
 from station.core.lens import project
+from station.core.robust import spread_of
 from workers.cloud.observed import CameraView
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
@@ -59,7 +60,6 @@ _MAX_OFFSET_PX, _MAX_SPREAD_PX = 4.0, 2.0
 """A side is used if it shows at least so many places, with a median and a spread (median absolute
 deviation, for a normal distribution) of at most this: sound ones have 1 px and 0.7. The projector's
 shadow leaves the edges of one side with few places."""
-_NORMAL_MAD = 1.4826
 _NEAR_MEDIAN_PX = 1.5
 """Places farther from the median do not count for the offset."""
 _TINY = 1e-9
@@ -121,7 +121,7 @@ def side_offsets_px(places: ContourPlaces, cameras: int) -> Array:
         if len(beyond) < _MIN_PLACES:
             continue
         middle = float(np.median(beyond))
-        spread = _NORMAL_MAD * float(np.median(np.abs(beyond - middle)))
+        spread = spread_of(beyond - middle)
         if abs(middle) <= _MAX_OFFSET_PX and spread <= _MAX_SPREAD_PX:
             offsets[side] = beyond[np.abs(beyond - middle) < _NEAR_MEDIAN_PX].mean()
     return offsets
