@@ -74,7 +74,8 @@ def start(config_path: Path | None, timeout_s: float) -> None:
                 "; ".join(f"camera {name}: {troubles.get(name, 'no frames')}" for name in silent)
             )
         time.sleep(_POLL_S)
-    click.echo(f"{len(config.cameras)} cameras streaming")
+    count = len(config.cameras)
+    click.echo(f"{count} camera{'s' if count > 1 else ''} streaming")
 
 
 @click.command()

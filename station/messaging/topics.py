@@ -1,4 +1,4 @@
-"""Every topic that is published: senders take rates, and sockets their queues, from this table.
+"""Every topic that is published, and how: sockets take their queues from this table.
 
 When a camera counts as silent is configured (`sync.silent_after_s`); when a process does is a
 matter of its health file (`station.booth.health`), which is there without any message.

@@ -226,10 +226,14 @@ def test_the_openapi_document_is_there_without_a_login(console: LiveConsole) -> 
 
 
 def test_the_readme_client_works(console: LiveConsole, tmp_path: Path) -> None:
-    """The program that the README shows, run as it stands there."""
-    program = re.search(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    """The program that the README shows, run as it stands there, with the token it shows."""
+    text = README.read_text()
+    command = re.search(r"station token make orders((?:\s+--scope \w+)+)", text)
+    program = re.search(r"```python\n(.*?)```", text, re.DOTALL)
+    assert command is not None
     assert program is not None
-    assert len(program[1].splitlines()) <= 32
+    assert set(re.findall(r"--scope (\w+)", command[1])) == {"read", "scan"}
+    assert len(program[1].splitlines()) <= 36
     path = tmp_path / "client.py"
     path.write_text(program[1])
     done = subprocess.run(

@@ -61,7 +61,7 @@ def read_triangles(path: Path) -> tuple[Array, NDArray[np.int32]]:
     points = _columns(rows, [name for name, _ in elements[0].scalars], ("x", "y", "z"))
     faces = elements[1] if len(elements) > 1 else _Element("face", 0)
     if faces.name != "face" or len(faces.lists) != 1 or faces.scalars:
-        raise ValueError("its second part is not a list of triangles")
+        raise ValueError("it has no list of triangles: fit a cloud of points first")
     if order:
         size, corner = (order + kind for kind in faces.lists[0])
         layout = np.dtype([("size", size), ("corners", corner, (3,))])
