@@ -153,7 +153,7 @@ def test_a_corrected_camera_stands_where_its_points_are_moved_to(
 def test_shifts_are_those_of_the_middle_of_each_cameras_points(
     model: BodyModel, body: np.ndarray
 ) -> None:
-    """Of three cameras one has no points."""
+    """Three cameras, one of which has no points."""
     view = _view(model, body)
     names = ("one", "blind", "other")
     views = [replace(view, name=name) for name in names]

@@ -20,7 +20,6 @@ from station.calibration.drift.reference import COMMON, LOCAL, DriftReference
 from station.core.depth_image import Image
 from station.core.geometry import invert, se3_exp, transform
 from station.core.lens import project
-from station.core.robust import spread_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -153,7 +152,7 @@ def _align(
     for step in range(_STEPS):
         off, inside = samples.off(now, xi)
         rest = np.abs(off - explained)
-        size = max(1.0, spread_of(rest[inside]))
+        size = max(1.0, 1.4826 * float(np.median(rest[inside])))
         weights = _weights(rest / size, convex=step < _CONVEX_STEPS) * inside / size**2
         local = np.outer(1.0 / wider, 1.0 / _LOCAL_SIGMA**2 if step >= _RIGID_STEPS else _NONE)
         change, information, explained, own = _solved(samples, weights, off, xi, prior, local)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.robust import spread_of
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
@@ -21,6 +20,7 @@ from workers.scape.evidence.crown import crown_rows
 from workers.scape.evidence.floor import floor_rows
 from workers.scape.evidence.free_space import FreeSpace
 from workers.scape.evidence.rims import rims_of
+from workers.scape.evidence.robust import spread_of
 from workers.scape.evidence.rows import CameraTerms, Rows, Skin, outline_rows
 from workers.scape.fit.annealing import AnnealingStep
 from workers.scape.model.body_model import BodyModel

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from station.core.geometry import invert, transform
 from station.core.lens import project
-from station.core.robust import spread_of
 from workers.cloud.observed import CameraView
+from workers.scape.evidence.robust import spread_of
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import Attachments
