@@ -101,9 +101,7 @@ def trace_all(
 
 @lru_cache(maxsize=64)
 def _triangles(model: BodyModel, parts: tuple[str, ...]) -> Index:
-    wanted = [model.part_names.index(part) for part in parts]
-    inside = np.isin(model.part_of_vertex, wanted)
-    return np.flatnonzero(inside[model.faces].all(axis=1))
+    return np.flatnonzero(model.of_parts(parts)[model.faces].all(axis=1))
 
 
 @lru_cache(maxsize=64)
@@ -199,9 +197,8 @@ class _Tracer:
         """Weighted mean of the vertices that protrude most."""
         levels = (self._plane(level)[0][2] for level in (plane.lower, plane.upper))
         low, high = sorted(levels)
-        names = [self._model.part_names.index(part) for part in plane.parts]
         height = self._vertices[:, 2]
-        inside = np.isin(self._model.part_of_vertex, names) & (low <= height) & (height <= high)
+        inside = self._model.of_parts(plane.parts) & (low <= height) & (height <= high)
         candidates = self._vertices[inside]
         if not len(candidates):
             raise ValueError("no vertex lies between the two levels")

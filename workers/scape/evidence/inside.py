@@ -26,18 +26,13 @@ def shares_inside(
     Args:
         vertices: (P, 3), metres, before crossings are mended.
     """
-    around = _of_parts(model, _AROUND)
+    around = model.of_parts(_AROUND)
     skin, normals = vertices[around], vertex_normals(vertices, model.faces)[around]
     tree = cKDTree(skin, balanced_tree=False)
     shares = []
     for parts in groups:
-        places = vertices[_of_parts(model, parts)]
+        places = vertices[model.of_parts(parts)]
         nearest = tree.query(places)[1]
         depth = -np.einsum("ij,ij->i", places - skin[nearest], normals[nearest])
         shares.append(float(np.mean(depth > _DEEP_M)))
     return shares
-
-
-def _of_parts(model: BodyModel, parts: Sequence[str]) -> NDArray[np.bool_]:
-    """Mask (P,) of some parts' vertices."""
-    return np.isin(model.part_of_vertex, [model.part_names.index(part) for part in parts])

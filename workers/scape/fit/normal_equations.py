@@ -128,7 +128,7 @@ def _along_normal(places: Array, normals: Array, points: Array) -> NDArray[np.bo
     """
     offset = points - places
     away = np.sqrt(np.einsum("ni,ni->n", offset, offset))
-    ahead = np.abs(np.einsum("ni,ni->n", offset, normals))
+    ahead = np.abs(_along(normals, offset))
     return np.asarray(away < _ASIDE * ahead + _SPACING_M)
 
 
@@ -192,7 +192,7 @@ def data_terms(
         # skin: by a millimetre and more, on all sides.
         places = attached(model, skin.positions, on_cloud, place)
         on_body, direction = places.of(skin.positions, model.faces), cloud.normals[point]
-    residual, sigma_m = along(direction, on_cloud - on_body), target.sigma_m[point]
+    residual, sigma_m = _along(direction, on_cloud - on_body), target.sigma_m[point]
     share = share_of_points(residual, sigma_m, annealing)
     rows = [_point_rows(place, direction, residual, sigma_m, annealing.scale_m, share)]
     camera_terms = None
@@ -217,11 +217,11 @@ def _rim_rows(
     """Rows that place the outlines of hands where cameras saw them end before the background."""
     offset = cameras.apply(rims.points[rimmed], rims.camera[rimmed]) - skin.positions[place]
     direction, sigma_m = rims.normals[rimmed], rims.sigma_m[rimmed]
-    residual = along(direction, offset)
+    residual = _along(direction, offset)
     return _point_rows(place, direction, residual, sigma_m, annealing.scale_m, annealing.row_share)
 
 
-def along(direction: Array, offset: Array) -> Array:
+def _along(direction: Array, offset: Array) -> Array:
     """Offsets (n, 3) along unit directions (n, 3)."""
     return np.asarray(np.einsum("ni,ni->n", direction, offset))
 

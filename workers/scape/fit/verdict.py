@@ -140,7 +140,7 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
     """
     areas = vertex_areas(vertices, model.faces)
     normals = vertex_normals(model.mean, model.faces)
-    trunk = np.isin(model.part_of_vertex, [model.part_names.index(name) for name in _TRUNK])
+    trunk = model.of_parts(_TRUNK)
     shares = {}
     for side, (direction, least_cosine) in _SIDES.items():
         there = trunk & (normals @ direction > least_cosine)

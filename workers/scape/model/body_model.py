@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
@@ -105,6 +106,10 @@ class BodyModel:
     def part_of_vertex(self) -> NDArray[np.int32]:
         """(P,): part with the largest weight."""
         return np.argmax(self.vertex_weights, axis=1).astype(np.int32)
+
+    def of_parts(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        """Mask (P,) of the vertices of some parts."""
+        return np.isin(self.part_of_vertex, [self.part_names.index(name) for name in names])
 
     @cached_property
     def hand_parts(self) -> NDArray[np.intp]:
