@@ -20,7 +20,7 @@ from station.core.rig import Rig
 from station.simulation.scene import Mesh, box, bumped, chair, default_rig, look_at
 from station.simulation.sensor import SimulatedBooth
 from workers.cloud.observed import PointCloud
-from workers.scape.learn.database import PARTS, BodyDatabase, Shapes
+from workers.scape.learn.database import PARTS, body_database
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class TestBodies:
     """Bodies that the model was not learned from, in poses that it was not learned from."""
 
     def __init__(self) -> None:
-        self._database = BodyDatabase()
+        self._database = body_database()
         self._shapes = self._database.sample("test", _POOL, _SEED)
         self._poses = self._database.sample_poses("test", _POOL, _SEED)
 
@@ -69,11 +69,12 @@ class TestBodies:
             for side, sign in (("L", 1.0), ("R", -1.0))
         ]
         closest_first = np.argsort(-np.minimum(*lowered), kind="stable")
-        leanest = int(self._leanest_first[0])
-        for index in closest_first:
-            if self._has_room(leanest, poses[index]):
-                return self._made(self._shapes.take(np.array([leanest])), poses[index])
-        raise RuntimeError("every held-out pose has an arm in the trunk")
+        leanest = self._shapes.take(self._leanest_first[:1])
+        posed = (self._database.vertices(leanest, pose[None])[0] for pose in poses[closest_first])
+        faces = self._database.faces
+        return on_the_mark(
+            first_with_room(self._database.vertices(leanest)[0], posed, faces), faces
+        )
 
     @cached_property
     def pregnant(self) -> Mesh:
@@ -98,16 +99,12 @@ class TestBodies:
 
     def _has_room(self, index: int, pose: Array) -> bool:
         shapes = self._shapes.take(np.array([index]))
-        neutral, posed = self._database.vertices(shapes)[0], self._made(shapes, pose).vertices
+        neutral, posed = (self._database.vertices(shapes, at)[0] for at in (None, pose[None]))
         return has_room(neutral, posed, self._database.faces)
 
     @cached_property
     def _leanest_first(self) -> NDArray[np.intp]:
         return np.argsort(self._database.sizes(self._shapes)[1], kind="stable")
-
-    def _made(self, shapes: Shapes, pose: Array) -> Mesh:
-        vertices = self._database.vertices(shapes, pose[None])[0]
-        return on_the_mark(vertices, self._database.faces)
 
 
 def family_cases(bodies: TestBodies, count: int) -> Iterator[Case]:

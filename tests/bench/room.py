@@ -18,7 +18,7 @@ TOUCHING = 40
 
 def has_room(neutral: Array, posed: Array, faces: Faces, touching: int = TOUCHING) -> bool:
     """Whether no limb of a body (P, 3) is in its trunk or in another limb in a pose."""
-    return self_intersections(posed, faces) <= self_intersections(neutral, faces) + touching
+    return self_intersections(posed, faces) <= _most(neutral, faces, touching)
 
 
 def first_with_room(
@@ -29,7 +29,13 @@ def first_with_room(
     Raises:
         RuntimeError: there is none.
     """
+    most = _most(neutral, faces, touching)
     for posed in poses:
-        if has_room(neutral, posed, faces, touching):
+        if self_intersections(posed, faces) <= most:
             return posed
     raise RuntimeError("every pose has a limb in the body")
+
+
+def _most(neutral: Array, faces: Faces, touching: int) -> int:
+    """Crossings at most, of a body that has room."""
+    return self_intersections(neutral, faces) + touching
