@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_fit import fitted, render_all
+from bench_fit import fitted, render
 from bench_measure import Table, measured_in, table_of
 from fit_cases import Case, TestBodies, family_cases, hard_cases
 from fit_report import Row
@@ -36,12 +36,20 @@ def model() -> BodyModel:
 
 
 @pytest.fixture(scope="module")
-def family(model: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> list[Row]:
-    return _fitted(model, [*family_cases(TestBodies(), BODIES)], tmp_path_factory.mktemp("family"))
+def bodies() -> TestBodies:
+    return TestBodies()
+
+
+@pytest.fixture(scope="module")
+def family(
+    model: BodyModel, bodies: TestBodies, tmp_path_factory: pytest.TempPathFactory
+) -> list[Row]:
+    return _fitted(model, [*family_cases(bodies, BODIES)], tmp_path_factory.mktemp("family"))
 
 
 def _fitted(model: BodyModel, cases: list[Case], folder: Path) -> list[Row]:
-    render_all(cases, folder)
+    for case in cases:
+        render(case, folder)
     return [fitted(case, model, folder)[0] for case in cases]
 
 
@@ -92,8 +100,8 @@ def test_bodies_unlike_the_model_keep_the_bars(model: BodyModel, tmp_path: Path)
     assert _held(table) > 0.80
 
 
-def test_nothing_is_lost_unnamed(model: BodyModel, tmp_path: Path) -> None:
-    cases = [case for case in hard_cases(TestBodies()) if case.name in HARD]
+def test_nothing_is_lost_unnamed(model: BodyModel, bodies: TestBodies, tmp_path: Path) -> None:
+    cases = [case for case in hard_cases(bodies) if case.name in HARD]
     assert len(cases) == len(HARD)
     assert {row.case.name: row.lost_unnamed for row in _fitted(model, cases, tmp_path)} == {
         name: [] for name in HARD

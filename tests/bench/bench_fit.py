@@ -94,7 +94,7 @@ def _folder(case: Case, folder: Path) -> Path:
     return folder / f"{case.group}-{case.name}"
 
 
-def _render(case: Case, folder: Path) -> None:
+def render(case: Case, folder: Path) -> None:
     if case.sensor is None or case.body is None:
         render_bundle(case.body, _folder(case, folder), case.booth)
     else:
@@ -106,7 +106,7 @@ def render_all(cases: Sequence[Case], folder: Path) -> None:
     start_s = time.perf_counter()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(_RENDERERS, mp_context=context) as pool:
-        for index, _ in enumerate(pool.map(_render, cases, [folder] * len(cases)), start=1):
+        for index, _ in enumerate(pool.map(render, cases, [folder] * len(cases)), start=1):
             if sys.stderr.isatty():
                 print(f"\rrendering {index} of {len(cases)} ", end="", file=sys.stderr, flush=True)
     print(f"{len(cases)} bundles rendered in {time.perf_counter() - start_s:.0f} s", flush=True)
