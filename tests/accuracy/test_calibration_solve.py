@@ -48,6 +48,11 @@ def seen(procedure: VirtualProcedure) -> Observations:
 
 
 @pytest.fixture(scope="module")
+def often_seen(procedure: VirtualProcedure) -> Observations:
+    return synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
+
+
+@pytest.fixture(scope="module")
 def solution(procedure: VirtualProcedure, seen: Observations) -> Solution:
     return solved(procedure.booth.rig, seen)
 
@@ -214,10 +219,11 @@ def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observ
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
 
 
-def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure) -> None:
+def test_two_cameras_that_agree_on_a_head_do_no_harm(
+    procedure: VirtualProcedure, often_seen: Observations
+) -> None:
     """The path was bent by decimetres there, and what the others saw of the ball, taken from so
     far off, could read as another scale of the whole booth: 14 mm, said to be less than one."""
-    seen = synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
     heads = [
         ball
         for time_s in procedure.starts_s(BALL) + np.arange(5.0, 55.0)
@@ -226,7 +232,7 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(procedure: VirtualProcedure
         )
     ]
     assert len(heads) == 100
-    solution = solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
+    solution = solved(procedure.booth.rig, replace(often_seen, balls=[*often_seen.balls, *heads]))
     twists = reference_errors(procedure.booth.rig, solution.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2.5e-3
 
@@ -241,10 +247,9 @@ def test_what_does_not_settle_is_refused(
 
 @pytest.mark.parametrize("gap_s", [0.1, 0.2])
 def test_a_head_that_is_seen_all_along_blames_no_sound_camera(
-    procedure: VirtualProcedure, gap_s: float
+    procedure: VirtualProcedure, often_seen: Observations, gap_s: float
 ) -> None:
     """The solution was lost: it ended in a traceback, or called a sound camera a scattering one."""
-    seen = synthetic.observations(procedure, rate_hz=INDEPENDENT_HZ)
     heads = [
         ball
         for time_s in procedure.starts_s(BALL) + np.arange(2.0, 58.0, gap_s)
@@ -256,7 +261,7 @@ def test_a_head_that_is_seen_all_along_blames_no_sound_camera(
         )
     ]
     with pytest.raises(CalibrationError, match="the cameras do not agree on where the ball was"):
-        solved(procedure.booth.rig, replace(seen, balls=[*seen.balls, *heads]))
+        solved(procedure.booth.rig, replace(often_seen, balls=[*often_seen.balls, *heads]))
 
 
 def test_a_head_taken_for_the_ball_is_no_camera_that_moved(
