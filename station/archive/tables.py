@@ -33,6 +33,12 @@ _WORDS = {
     "zh": {"ok": "合格", "rescan": "请重新扫描", "as-scanned": "扫描姿势", "standard": "标准姿势",
            "left": "左", "right": "右"},
 }  # fmt: skip
+_MARKS = {
+    "partly": ("*", "the cameras saw only a part of this line"),
+    "inferred": ("**", "the cameras saw hardly any of this line; it is inferred"),
+}
+_PRINTED = 24
+"""Letters that a value with its interval and mark takes in a terminal."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -77,6 +83,36 @@ def _row(entry: dict[str, Any], unit: Unit, language: Language) -> dict[str, Any
         "basis": entry.get("basis") or "",
         "standard": str(entry.get("standard", "")),
     }
+
+
+def printed_table(document: dict[str, Any]) -> list[str]:
+    """Lines of a result's table for a terminal: centimetres, both sides beside each other."""
+    listed = rows(document, "cm", "en")
+    width = max((len(row["words"]) for row in listed), default=0)
+    single = [row for row in listed if not row["side"]]
+    lines = [f"{'':<{width}}  {'cm':>7}  95 % interval"]
+    lines += [f"{row['words']:<{width}}  {_printed(row)}".rstrip() for row in single]
+    sides: dict[str, dict[str, str]] = {}
+    for row in listed:
+        if row["side"]:
+            sides.setdefault(row["words"], {})[row["side"]] = _printed(row)
+    if sides:
+        lines += ["", f"{'':<{width}}  {'left':>7}{'':<{_PRINTED - 7}}  {'right':>7}"]
+    lines += [
+        f"{words:<{width}}  {of.get('left', ''):<{_PRINTED}}  {of.get('right', '')}".rstrip()
+        for words, of in sides.items()
+    ]
+    used = {row["basis"] for row in listed}
+    notes = [f"{mark} {words}" for basis, (mark, words) in _MARKS.items() if basis in used]
+    return [*lines, "", *notes] if notes else lines
+
+
+def _printed(row: dict[str, Any]) -> str:
+    """A value with its interval; a mark where the cameras did not see all of the line."""
+    if row["value"] is None:
+        return f"{'-':>7}  not measured"
+    mark = _MARKS[row["basis"]][0] if row["basis"] in _MARKS else ""
+    return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f}{mark:>2}"
 
 
 def side_differences(

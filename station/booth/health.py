@@ -60,7 +60,7 @@ def booth_health(config: BoothConfig) -> BoothHealth:
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
-    if not any(processes.values()):
+    if not any(content and content["age_s"] <= MAX_AGE_S for content in processes.values()):
         return ["no process of the booth is running here; start it with: station run"]
     return [
         f"the {name} process has not reported for {content['age_s']:.0f} s; it is restarted "

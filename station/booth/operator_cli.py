@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from station.archive.tables import printed_table, read_measurements
 from station.booth.health import MAX_AGE_S, booth_health
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import config_option
@@ -205,13 +206,13 @@ def scan(
         raise BoothError(f"scan {scan_id} failed: {session['reason']}")
     if not wait:
         return
-    click.echo(session["path"])
     again = session["state"] == "rescan"
     if again:
         # Before any number, which nobody should then take down.
         click.echo(f"scan again: {session['reason']}", err=True)
     show_result(session["path"])
-    click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result")
+    click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result:")
+    click.echo(session["path"])
     if again:
         sys.exit(_EXIT_RESCAN)
 
@@ -304,18 +305,11 @@ def _text(label: str) -> str:
 
 
 def show_result(path: str) -> None:
-    """Print a delivered result's table; a blank row as not measured."""
+    """Print a delivered result's table."""
     folder = Path(path)
     if not path or not folder.is_dir():
         click.echo("  delivered; the result has been taken from the outbox")
         return
-    document = json.loads((folder / "measurements.json").read_text())
     click.echo("")
-    width = max(len(row["name"]) for row in document["measurements"])
-    for row in document["measurements"]:
-        if row["value_m"] is None:
-            click.echo(f"  {row['name']:<{width}}    not measured")
-            continue
-        low, high = (100 * end for end in row["interval95_m"])
-        value = 100 * row["value_m"]
-        click.echo(f"  {row['name']:<{width}} {value:7.1f} cm  {low:6.1f} to {high:5.1f}")
+    for line in printed_table(read_measurements(folder, "as-scanned")):
+        click.echo(f"  {line}".rstrip())

@@ -235,7 +235,10 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
 def _purge_label(spool: Spool, label: str) -> list[Path]:
     found = ScanIndex(spool).find(label=label, limit=_MAX_LABEL_LENGTH)
     if not found:
-        raise SpoolError(f"there is no scan with the label {label!r}; see station list")
+        raise SpoolError(
+            f"there is no scan with the label {label!r}; see station list; "
+            "a scan that is being taken is ended with station cancel"
+        )
     return [folder for scan in found for folder in purge_scan(spool, scan.scan_id)]
 
 

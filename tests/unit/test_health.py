@@ -26,10 +26,10 @@ def config(tmp_path: Path) -> BoothConfig:
     return load_config(tmp_path / "booth.toml")
 
 
-def _tell(config: BoothConfig, process: str, **content: Any) -> None:
+def _tell(config: BoothConfig, process: str, age_s: float = 0.0, **content: Any) -> None:
     folder = config.runtime.folder / HEALTH
     folder.mkdir(parents=True, exist_ok=True)
-    document = {"told_s": time.monotonic(), **content}
+    document = {"told_s": time.monotonic() - age_s, **content}
     (folder / f"{file_name(process)}.json").write_text(json.dumps(document))
 
 
@@ -62,3 +62,14 @@ def test_what_sync_says_of_its_disk_and_sensors_is_named(config: BoothConfig) ->
     words = "the spool's disk has not answered for 4 s"
     found = _problems(config, streaming=True, silent=[], cameras=cameras, problems=[words])
     assert found == ["camera a: it keeps sending the same picture", words]
+
+
+def test_a_booth_that_was_stopped_is_told_in_one_sentence(config: BoothConfig) -> None:
+    """Each process's last report was an alarm of its own."""
+    for process in ("capture a", "capture b", "workers", "sync", "control"):
+        _tell(config, process, age_s=60.0)
+    assert booth_health(config).problems == [
+        "no process of the booth is running here; start it with: station run"
+    ]
+    _tell(config, "control")
+    assert len(booth_health(config).problems) == 4

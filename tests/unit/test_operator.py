@@ -2,26 +2,35 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from station.booth.operator_cli import show_result
 
 
-def test_a_blank_row_is_printed_as_not_measured(
+def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
+    ends = [None, None] if value_m is None else [value_m - half_m, value_m + half_m]
+    return {"name": name, "value_m": value_m, "interval95_m": ends, "basis": basis}
+
+
+def test_a_result_is_printed_with_plain_names_and_both_sides_on_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The table of a scan with a missing part ended in a traceback."""
-    names = "waist_girth", "neck_shoulder_to_waist_front_right"
-    values = (0.842, [0.834, 0.850]), (None, None)
     rows = [
-        {"name": name, "value_m": value, "interval95_m": interval}
-        for name, (value, interval) in zip(names, values, strict=True)
+        _row("waist_girth", 0.842),
+        _row("neck_shoulder_to_waist_front_left", 0.441, basis="partly"),
+        _row("neck_shoulder_to_waist_front_right", None),
+        _row("hand_length_right", 0.19),
     ]
-    (tmp_path / "measurements.json").write_text(json.dumps({"measurements": rows}))
+    document = {"format": "booth-measurements", "version": 1, "measurements": rows}
+    (tmp_path / "measurements.json").write_text(json.dumps(document))
     show_result(str(tmp_path))
-    lines = capsys.readouterr().out.splitlines()
-    waist, shoulder = (line for line in lines if line.startswith("  ne") or "waist_girth" in line)
-    assert waist.endswith("84.2 cm    83.4 to  85.0")
-    assert shoulder.endswith("not measured")
-    assert waist.index("84.2") > len("  neck_shoulder_to_waist_front_right")
+    heading, waist, _, sides, neck, hand, _, note = capsys.readouterr().out.splitlines()[1:]
+    assert heading.split() == ["cm", "95", "%", "interval"]
+    assert waist.split() == ["Waist", "girth", "84.2", "83.4", "to", "85.0"]
+    assert sides.split() == ["left", "right"]
+    assert neck.endswith("44.1   43.3 to  44.9 *        -  not measured")
+    assert hand.index("19.0") == sides.index("right") + 1
+    assert "not measured" not in hand
+    assert note == "  * the cameras saw only a part of this line"

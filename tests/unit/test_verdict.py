@@ -144,6 +144,15 @@ def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
     assert set(verdict.missing) == {"thigh_right", "shin_right", "foot_right"}
 
 
+def test_who_seems_short_without_feet_is_told_of_the_feet_first(model: BodyModel) -> None:
+    sides = {"front": 0.9, "back": 0.9}
+    for coverage, short_at in ((0.0, 1), (0.9, 0)):
+        parts = [PartReport("foot_left", coverage, 1e-3)]
+        verdict = judge(parts, sides, (), {}, 1.28, np.zeros(model.beta_count), {}, 1e-3)
+        assert verdict.reasons[short_at].startswith("the person is 1.28 m tall")
+        assert len(verdict.reasons) == short_at + 1
+
+
 def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> None:
     """A forearm was 150 mm off: the points on a quarter of it were those of the elbow."""
     names = ("upper_arm_left", "forearm_left", "hand_left")

@@ -26,8 +26,6 @@ _FRAMES = 30
 _SENSORS_S = 20.0
 _EXIT_MOVED = 3
 _EXIT_CHANGED = 4
-_SAME_SHARE = 0.97
-"""An unchanged booth shows all of the stored background, a person hides a third of it."""
 
 
 @click.command()
@@ -61,7 +59,7 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
         _correct(config)
         return
     moves = _moves(config, recordings, quiet=as_json)
-    changed = [move for move in moves if not (move.lost or move.moved) and move.share < _SAME_SHARE]
+    changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
     if as_json:
         click.echo(json.dumps([_document(move) for move in moves]))

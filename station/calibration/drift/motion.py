@@ -26,6 +26,8 @@ MIN_SHARE = 0.15
 """Less of the stored background than this tells nothing."""
 _NOTHING_MET = 0.05
 """Less than this is no person, bag and chair that fill a view: it needs no second scan."""
+_SAME_SHARE = 0.97
+"""An unchanged booth shows all of the stored background, a person hides a third of it."""
 _CERTAINTY = 2.0
 """A camera alarms if it is so many standard deviations from the nearest move within the tolerance
 ..."""
@@ -83,6 +85,11 @@ class CameraMove:
     def moved(self) -> bool:
         """It has to be calibrated again before the next scan."""
         return not self.lost and self.alarm() > 1.0
+
+    @property
+    def changed(self) -> bool:
+        """It shows no move, but a small one could be hidden by what has changed in its view."""
+        return not (self.lost or self.moved) and self.share < _SAME_SHARE
 
     @property
     def certain(self) -> bool:
@@ -148,6 +155,11 @@ class CameraMove:
                 f"camera {self.camera} no longer sees what it saw when it was calibrated "
                 f"({100 * self.share:.0f} % of it): it was turned away, or something stands in its "
                 "way"
+            )
+        if self.changed:
+            return (
+                f"camera {self.camera} shows no move, but {100 * (1.0 - self.share):.0f} % of what "
+                "it saw when it was calibrated is covered or different"
             )
         if not self.moved:
             return f"camera {self.camera} stands where it was calibrated"

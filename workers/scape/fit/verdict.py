@@ -62,6 +62,8 @@ half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck", "head")
 _CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
 """Parts of a limb, outwards."""
+_UPRIGHT = ("head", "neck", "thigh", "shin", "foot")
+"""Parts without which a body seems shorter."""
 _SCATTER_M = 0.006
 """Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
 sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
@@ -199,7 +201,10 @@ def judge(
     halves = _unseen_sides(sides)
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
-    reasons = [finding.message for finding in findings] + moved + _unlike_people(stature_m, beta)
+    unlike = _unlike_people(stature_m, beta)
+    # A person without feet or head is short for that reason, which comes first.
+    cut = any(part.startswith(_UPRIGHT) for part in (*lost, *unseen))
+    reasons = [finding.message for finding in findings] + moved + ([] if cut else unlike)
     if everywhere:
         reasons.append("too much of the scan does not match a body: nothing can be measured")
     # What lies beside a body whose arm or head was not found may be that.
@@ -209,6 +214,7 @@ def judge(
         reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
     else:
         reasons += unseen.values()
+    reasons += unlike if cut else []
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
