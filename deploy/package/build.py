@@ -33,6 +33,8 @@ ROOT = Path(__file__).parents[2]
 BOOTH, SIMULATION = "body-booth", "body-booth-simulation"
 MOUNTED = {BOOTH: Path("/opt/booth"), SIMULATION: Path("/opt/booth.simulation")}
 """Package -> where its image is mounted; a .pth file of the booth names the simulation's."""
+DRIVERS = Path("/usr/local/lib/body-booth")
+"""Folder for drivers of a shop's own sensors, which no upgrade replaces."""
 
 _NOT_SHIPPED_OPEN3D = ("open3d_tf_ops.so", "open3d_torch_ops.so")
 """For machine learning frameworks that a booth has not."""
@@ -112,7 +114,7 @@ def build_booth(
     # pip would note the path that it came from.
     known = set(site.iterdir())
     shutil.unpack_archive(wheel, site, "zip")
-    (site / "booth-simulation.pth").write_text(f"{MOUNTED[SIMULATION]}\n")
+    (site / "booth.pth").write_text(f"{MOUNTED[SIMULATION]}\n{DRIVERS}\n")
     for package in sorted(set(site.iterdir()) - known):
         if package.is_dir():
             compile_all(package, MOUNTED[BOOTH] / SITE / package.name)

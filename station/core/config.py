@@ -287,7 +287,11 @@ def load_config(path: Path) -> BoothConfig:
     try:
         document = tomllib.loads(path.read_text())
     except PermissionError:
-        raise ConfigError(f"{path} may not be read by you; run the command with sudo") from None
+        # Under sudo, an installed booth's commands run as its user.
+        raise ConfigError(
+            f"{path} may not be read by you; run the command with sudo, or put the file where the "
+            "user booth may read it"
+        ) from None
     except OSError as cause:
         raise ConfigError(
             f"{path} cannot be read ({cause.strerror}); station setup writes it, --config names "

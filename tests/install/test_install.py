@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -23,6 +25,8 @@ _DELIVERED = (0, 3)
 """`station scan`: a result, or a result that says to scan again."""
 _RESTART_BAR_S, _BOOT_BAR_S, _FIRST_SCAN_BAR_S, _SIZE_BAR_MB = 3.0, 15.0, 120.0, 250.0
 _EXPOSURE_BAR = 1.5
+_EXTENDING = Path(__file__).parents[2] / "docs/extending.md"
+_DRIVERS = "/usr/local/lib/body-booth"
 
 
 def _until(true: Callable[[], bool], what: str, limit_s: float = 300.0) -> float:
@@ -254,6 +258,35 @@ def test_a_backup_makes_another_machine_the_same_booth(
     finally:
         other.close()
         machine.run("systemctl", "start", "booth.target")
+
+
+def test_a_driver_of_another_sensor_streams(machine: Machine, tmp_path: Path) -> None:
+    """The example of the documents, as a shop would add it."""
+    blocks = re.findall(r"```(?:toml|python)\n(.*?)```", _EXTENDING.read_text(), re.DOTALL)
+    for name, text in zip(("pyproject.toml", "myrig.py", "booth.toml"), blocks, strict=False):
+        (tmp_path / name).write_text(text)
+    with (tmp_path / "booth.toml").open("a") as file:
+        file.write("[console]\nenabled = false\n")  # the booth's own has the port
+    build = ("wheel", "--quiet", "--no-index", "--no-deps", "--no-build-isolation")
+    subprocess.run(
+        [sys.executable, "-m", "pip", *build, "--wheel-dir", tmp_path, tmp_path], check=True
+    )
+    [wheel] = tmp_path.glob("*.whl")
+    machine.put(wheel, f"/root/{wheel.name}")
+    machine.put(tmp_path, "/srv/other", owner="booth")
+    machine.run("python3", "-m", "zipfile", "-e", f"/root/{wheel.name}", _DRIVERS)
+    options = ("--config", "/srv/other/booth.toml")
+    machine.run("systemd-run", "--unit", "other-booth", "station", "run", *options)
+    try:
+        _until(
+            lambda: machine.run("station", "start", *options, check=False).returncode == 0,
+            "the other sensor streams",
+            limit_s=30.0,
+        )
+    finally:
+        machine.run("systemctl", "stop", "other-booth")
+        machine.run("rm", "-r", _DRIVERS, "/srv/other")
+        machine.run("find", "/usr/local", "-empty", "-delete")
 
 
 def test_purge_leaves_nothing(machine: Machine, untouched: set[str]) -> None:
