@@ -37,8 +37,6 @@ _MARKS = {
     "partly": ("*", "the cameras saw only a part of this line"),
     "inferred": ("**", "the cameras saw hardly any of this line; it is inferred"),
 }
-_PRINTED = 24
-"""Letters that a value with its interval and mark takes in a terminal."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -96,10 +94,11 @@ def printed_table(document: dict[str, Any]) -> list[str]:
     for row in listed:
         if row["side"]:
             sides.setdefault(row["words"], {})[row["side"]] = _printed(row)
+    column = max((len(of.get("left", "")) for of in sides.values()), default=0)
     if sides:
-        lines += ["", f"{'':<{width}}  {'left':>7}{'':<{_PRINTED - 7}}  {'right':>7}"]
+        lines += ["", f"{'':<{width}}  {'left':>7}{'':<{max(0, column - 7)}}  {'right':>7}"]
     lines += [
-        f"{words:<{width}}  {of.get('left', ''):<{_PRINTED}}  {of.get('right', '')}".rstrip()
+        f"{words:<{width}}  {of.get('left', ''):<{column}}  {of.get('right', '')}".rstrip()
         for words, of in sides.items()
     ]
     used = {row["basis"] for row in listed}
@@ -112,7 +111,7 @@ def _printed(row: dict[str, Any]) -> str:
     if row["value"] is None:
         return f"{'-':>7}  not measured"
     mark = _MARKS[row["basis"]][0] if row["basis"] in _MARKS else ""
-    return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f}{mark:>2}"
+    return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f} {mark:<2}"
 
 
 def side_differences(

@@ -47,21 +47,32 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     processes = {service.name: read_health(folder, service.name) for service in services(config)}
     problems = _silent(processes)
     sync = processes["sync"]
-    if not sync or sync["age_s"] > MAX_AGE_S:
+    if not _reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
     problems += _cameras(sync, wanted=bool(processes["control"].get("streaming")))
     problems += [
-        str(problem) for content in processes.values() for problem in content.get("problems", [])
+        str(problem)
+        for content in processes.values()
+        if _reports(content)
+        for problem in content.get("problems", [])
     ]
     problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
 
 
+def _reports(content: dict[str, Any]) -> bool:
+    """A process's last report is fresh; what an older one says may have passed."""
+    return bool(content) and content["age_s"] <= MAX_AGE_S
+
+
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
-    if not any(content and content["age_s"] <= MAX_AGE_S for content in processes.values()):
-        return ["no process of the booth is running here; start it with: station run"]
+    if not any(map(_reports, processes.values())):
+        return [
+            "no process of the booth is running here; start it with: station run, or an installed "
+            "booth with: sudo systemctl start booth.target"
+        ]
     return [
         f"the {name} process has not reported for {content['age_s']:.0f} s; it is restarted "
         "automatically under station run or systemd"
@@ -69,7 +80,7 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         else f"the {name} process is not running; see journalctl -u 'booth-*', or the "
         "terminal of station run"
         for name, content in processes.items()
-        if not content or content["age_s"] > MAX_AGE_S
+        if not _reports(content)
     ]
 
 

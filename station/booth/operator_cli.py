@@ -210,9 +210,16 @@ def scan(
     if again:
         # Before any number, which nobody should then take down.
         click.echo(f"scan again: {session['reason']}", err=True)
-    show_result(session["path"])
-    click.echo(f"\n{time.monotonic() - began_s:.1f} s from the command to the result:")
-    click.echo(session["path"])
+    took = f"{time.monotonic() - began_s:.1f} s from the command to the result"
+    path = session["path"]
+    if not path or not Path(path).is_dir():
+        click.echo(f"  {took}, which has been taken from the outbox")
+    else:
+        try:
+            show_result(Path(path))
+        finally:
+            # Where the table cannot be read, the folder still holds the surface.
+            click.echo(f"\n{took}:\n{path}")
     if again:
         sys.exit(_EXIT_RESCAN)
 
@@ -304,12 +311,12 @@ def _text(label: str) -> str:
     return "".join(letter if letter.isprintable() else " " for letter in text)[:MAX_LABEL_LENGTH]
 
 
-def show_result(path: str) -> None:
-    """Print a delivered result's table."""
-    folder = Path(path)
-    if not path or not folder.is_dir():
-        click.echo("  delivered; the result has been taken from the outbox")
-        return
+def show_result(folder: Path) -> None:
+    """Print a delivered result's table.
+
+    Raises:
+        FormatError: it cannot be read.
+    """
     click.echo("")
     for line in printed_table(read_measurements(folder, "as-scanned")):
         click.echo(f"  {line}".rstrip())

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from station.booth.operator_cli import show_result
+from station.core.errors import FormatError
 
 
 def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
@@ -22,15 +23,27 @@ def test_a_result_is_printed_with_plain_names_and_both_sides_on_a_line(
         _row("neck_shoulder_to_waist_front_left", 0.441, basis="partly"),
         _row("neck_shoulder_to_waist_front_right", None),
         _row("hand_length_right", 0.19),
+        _row("calf_girth_left", 0.36, basis="inferred"),
+        _row("calf_girth_right", 0.37),
     ]
     document = {"format": "booth-measurements", "version": 1, "measurements": rows}
     (tmp_path / "measurements.json").write_text(json.dumps(document))
-    show_result(str(tmp_path))
-    heading, waist, _, sides, neck, hand, _, note = capsys.readouterr().out.splitlines()[1:]
+    show_result(tmp_path)
+    lines = capsys.readouterr().out.splitlines()[1:]
+    heading, waist, _, sides, neck, hand, calf, _, partly, inferred = lines
     assert heading.split() == ["cm", "95", "%", "interval"]
     assert waist.split() == ["Waist", "girth", "84.2", "83.4", "to", "85.0"]
     assert sides.split() == ["left", "right"]
-    assert neck.endswith("44.1   43.3 to  44.9 *        -  not measured")
-    assert hand.index("19.0") == sides.index("right") + 1
+    assert neck.endswith("44.1   43.3 to  44.9 *         -  not measured")
+    assert "36.0   35.2 to  36.8 **" in calf
+    for row, value in ((hand, "19.0"), (calf, "37.0")):
+        assert row.index(value) + len(value) == sides.index("right") + len("right")
     assert "not measured" not in hand
-    assert note == "  * the cameras saw only a part of this line"
+    assert partly == "  * the cameras saw only a part of this line"
+    assert inferred.startswith("  ** ")
+
+
+def test_a_result_whose_table_is_damaged_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "measurements.json").write_text("{")
+    with pytest.raises(FormatError, match="damaged"):
+        show_result(tmp_path)

@@ -146,11 +146,21 @@ def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
 
 def test_who_seems_short_without_feet_is_told_of_the_feet_first(model: BodyModel) -> None:
     sides = {"front": 0.9, "back": 0.9}
-    for coverage, short_at in ((0.0, 1), (0.9, 0)):
+    for coverage, stature_m, at in ((0.0, 1.28, 1), (0.9, 1.28, 0), (0.0, 2.31, 0)):
         parts = [PartReport("foot_left", coverage, 1e-3)]
-        verdict = judge(parts, sides, (), {}, 1.28, np.zeros(model.beta_count), {}, 1e-3)
-        assert verdict.reasons[short_at].startswith("the person is 1.28 m tall")
-        assert len(verdict.reasons) == short_at + 1
+        verdict = judge(parts, sides, (), {}, stature_m, np.zeros(model.beta_count), {}, 1e-3)
+        assert verdict.reasons[at].startswith(f"the person is {stature_m} m tall")
+        assert len(verdict.reasons) == 1 + (coverage == 0.0)
+
+
+def test_what_is_no_person_is_told_before_its_missing_parts(model: BodyModel) -> None:
+    sides = {"front": 0.9, "back": 0.9}
+    parts = [PartReport("foot_left", 0.0, 1e-3)]
+    verdict = judge(parts, sides, (), {}, 1.28, np.full(model.beta_count, 9.0), {}, 1e-3)
+    nobody, unseen, short = verdict.reasons
+    assert nobody == "what stands in the booth does not look like a person"
+    assert "left foot" in unseen
+    assert short.startswith("the person is 1.28 m tall")
 
 
 def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> None:

@@ -201,10 +201,12 @@ def judge(
     halves = _unseen_sides(sides)
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
-    unlike = _unlike_people(stature_m, beta)
+    stature = _stature_of_nobody(stature_m)
     # A person without feet or head is short for that reason, which comes first.
-    cut = any(part.startswith(_UPRIGHT) for part in (*lost, *unseen))
-    reasons = [finding.message for finding in findings] + moved + ([] if cut else unlike)
+    cut = stature_m < _STATURES_M[0] and any(part.startswith(_UPRIGHT) for part in (*lost, *unseen))
+    reasons = [finding.message for finding in findings] + moved + ([] if cut else stature)
+    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
+        reasons.append("what stands in the booth does not look like a person")
     if everywhere:
         reasons.append("too much of the scan does not match a body: nothing can be measured")
     # What lies beside a body whose arm or head was not found may be that.
@@ -214,7 +216,7 @@ def judge(
         reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
     else:
         reasons += unseen.values()
-    reasons += unlike if cut else []
+    reasons += stature if cut else []
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
@@ -233,17 +235,14 @@ def judge(
     )
 
 
-def _unlike_people(stature_m: float, beta: Array) -> list[str]:
+def _stature_of_nobody(stature_m: float) -> list[str]:
     low, high = _STATURES_M
-    reasons = []
-    if not low < stature_m < high:
-        reasons.append(
-            f"the person is {stature_m:.2f} m tall; only adults of {low:.2f} to {high:.2f} m can "
-            "be measured"
-        )
-    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
-        reasons.append("what stands in the booth does not look like a person")
-    return reasons
+    if low < stature_m < high:
+        return []
+    return [
+        f"the person is {stature_m:.2f} m tall; only adults of {low:.2f} to {high:.2f} m can "
+        "be measured"
+    ]
 
 
 def _unseen_sides(sides: Mapping[str, float]) -> list[str]:
