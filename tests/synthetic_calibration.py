@@ -23,7 +23,7 @@ from station.calibration.detect.detections import (
     FLOOR,
     FRONT,
     MARK,
-    STAND,
+    RAISED,
     BallDetection,
     Observations,
     PlaneObservation,
@@ -97,7 +97,7 @@ def observations(
     waved: list[BallDetection] = []
     planes: list[PlaneObservation | None] = []
     steps = [MARK, FRONT, *(step for step in procedure.steps if step.startswith(AROUND))]
-    steps += [step for step in procedure.steps if stands and step.startswith(STAND)]
+    steps += [step for step in procedure.steps if stands and step.startswith(RAISED)]
     resting: dict[str, list[BallDetection]] = {step: [] for step in steps}
     start_s = procedure.starts_s(BALL)
     for index, name in enumerate(procedure.booth.rig.cameras):
@@ -110,8 +110,11 @@ def observations(
             if seen is not None:
                 waved.append(replace(seen, time_s=float(time_s + late_s)))
         for step, found in resting.items():
-            center_m, axis = procedure.resting_m(step), procedure.axis(step, 0.0)
-            looks = [_ball(unit, center_m, axis, procedure, rng) for _ in range(15)]
+            axis = procedure.axis(step, 0.0)
+            looks = [
+                _ball(unit, procedure.resting_m(step, time_s), axis, procedure, rng)
+                for time_s in 0.2 * np.arange(15)
+            ]
             found += [detection for detection in looks if detection is not None]
         planes.append(_floor(unit, procedure.booth, rng))
         for place, y in enumerate(procedure.board_at_m if boards else ()):

@@ -13,8 +13,9 @@ from station.calibration.detect.detections import (
     BALL,
     EMPTY,
     FRONT,
+    HANGING,
     MARK,
-    STAND,
+    RAISED,
     BallDetection,
     Observations,
     PlaneObservation,
@@ -31,7 +32,7 @@ _Depth = NDArray[np.uint16]
 
 _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
-_LOOK_S = 1.0
+_LOOK_S, _HANGING_LOOK_S = 1.0, 3.0
 """At the ball on the floor, and at the board."""
 
 
@@ -76,7 +77,9 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )
     around = {
-        step: balls(step, _LOOK_S) for step in procedure.steps if step.startswith((AROUND, STAND))
+        step: balls(step, _HANGING_LOOK_S if step.startswith(HANGING) else _LOOK_S)
+        for step in procedure.steps
+        if step.startswith((AROUND, *RAISED))
     }
     return Observations(
         waved, mark, front, [plane for plane in planes if plane is not None], around

@@ -10,7 +10,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.detections import AROUND, BALL, EMPTY, FRONT, MARK, STAND
+from station.calibration.detect.detections import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    HANGING,
+    MARK,
+    RAISED,
+    STAND,
+    raised_height_m,
+)
 from station.core.errors import InputError
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.simulation import violations
@@ -28,7 +38,7 @@ Array = NDArray[np.float64]
 
 STRIDE = FRAME_RATE_HZ / INDEPENDENT_HZ
 """Every so many frames of a ball are used."""
-_REST_S = 2.0
+_REST_S, _HANG_S = 2.0, 4.0
 _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""
 _STILL_FRAMES = 8
@@ -51,19 +61,25 @@ class VirtualProcedure:
     """y of the board's middle at each of its places."""
     around_m: tuple[tuple[float, float], ...] = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6))
     """x, y of the ball at each of its places on the floor around the mark."""
-    stand_m: tuple[float, ...] = (0.9, 1.7)
-    """Stated heights of the ball's underside above the floor, on a stand on the mark."""
+    hanging: bool = False
+    """Above the mark, the ball hangs from a hook; otherwise it is on a stand."""
     _views: dict[tuple[str, float | None], TrueView] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+
+    @property
+    def raised_m(self) -> tuple[float, ...]:
+        """Stated heights of the ball's underside above the floor."""
+        return (0.4, 1.7) if self.hanging else (0.9, 1.7)
 
     @property
     def steps(self) -> tuple[str, ...]:
         """All steps in their order."""
         walls = (f"wall-{i}" for i in range(len(self.board_at_m)))
         around = (f"{AROUND}-{i}" for i in range(len(self.around_m)))
-        stands = (f"{STAND}-{round(1e3 * height)}" for height in self.stand_m)
-        return (EMPTY, BALL, MARK, FRONT, *walls, *around, *stands)
+        kind = HANGING if self.hanging else STAND
+        raised = (f"{kind}-{round(1e3 * height)}" for height in self.raised_m)
+        return (EMPTY, BALL, MARK, FRONT, *walls, *around, *raised)
 
     def starts_s(self, step: str) -> float:
         """True time at which a step begins."""
@@ -84,7 +100,7 @@ class VirtualProcedure:
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, self._board_y_m(step))
         # The background is a short loop with noise; only moving objects are drawn in each frame.
-        moves = step in (BALL, MARK, FRONT) or step.startswith((AROUND, STAND))
+        moves = step in (BALL, MARK, FRONT) or step.startswith((AROUND, *RAISED))
         still = NoiselessView.of(view, unit.error)
         loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
@@ -111,7 +127,9 @@ class VirtualProcedure:
         return self._path.at(time_s - self.starts_s(BALL))
 
     def _lasts_s(self, step: str) -> float:
-        return self.waving_s if step == BALL else _REST_S
+        if step == BALL:
+            return self.waving_s
+        return _HANG_S if step.startswith(HANGING) else _REST_S
 
     def _board_y_m(self, step: str) -> float | None:
         return (
@@ -147,17 +165,19 @@ class VirtualProcedure:
         heading = self._path.heading(time_s) if step == BALL else 0.0
         return violations.oval_axis(self.booth.seed, heading)
 
-    def resting_m(self, step: str) -> Array:
-        """True centre (3,) of the ball that rests in a step."""
+    def resting_m(self, step: str, time_s: float) -> Array:
+        """True centre (3,) of the ball that rests in a step; what hangs still swings a little."""
         x, y, height = 0.0, 0.0, 0.0
         if step == FRONT:
             y = -self.front_m
         elif step.startswith(AROUND):
             x, y = self.around_m[int(step.removeprefix(f"{AROUND}-"))]
-        elif step.startswith(STAND):
-            stated_mm = int(step.removeprefix(f"{STAND}-"))
+        elif (stated_m := raised_height_m(step)) is not None:
+            stated_mm = round(1e3 * stated_m)
             rng = np.random.default_rng((self.booth.seed, 11, stated_mm))
-            height = 1e-3 * stated_mm + rng.uniform(-_TAPE_M, _TAPE_M)
+            height = stated_m + rng.uniform(-_TAPE_M, _TAPE_M)
+            if step.startswith(HANGING):
+                x, y = violations.hung_m(self.booth.seed, stated_mm, height, time_s)
         bow = violations.bow_m(self.booth.violations, self.booth.seed, np.array(x), np.array(y))
         return np.array([x, y, height + float(bow) + self.true_radius_m])
 
@@ -165,7 +185,8 @@ class VirtualProcedure:
         if step == EMPTY or step.startswith("wall-"):
             return []
         radius_m, switches = self.true_radius_m, self.booth.violations
-        center = self.ball_center_m(time_s) if step == BALL else self.resting_m(step)
+        waved = step == BALL
+        center = self.ball_center_m(time_s) if waved else self.resting_m(step, time_s)
         shapes = [ball(center, radius_m, self.axis(step, time_s), self.oval_share)]
         if step == BALL:
             shapes += self._path.person(

@@ -53,6 +53,7 @@ _PROCESSES = 2
     help="also record a calibration, the ball waved for so many seconds; sensors then have depth "
     "errors of their own, and no calibration.json is written",
 )
+@click.option("--hanging", is_flag=True, help="in it, the ball hangs, instead of a stand")
 def record_virtual(
     body: Path | None,
     out_folder: Path,
@@ -61,6 +62,7 @@ def record_virtual(
     passes: int,
     driver: str,
     waving_s: float | None,
+    hanging: bool,
 ) -> None:
     """Render a person in a virtual booth as one recording a camera, with booth.toml.
 
@@ -81,7 +83,7 @@ def record_virtual(
         for name in booth.rig.cameras
     }
     if waving_s is not None:
-        procedure = VirtualProcedure(booth, waving_s=waving_s)
+        procedure = VirtualProcedure(booth, waving_s=waving_s, hanging=hanging)
         for step in procedure.steps:
             for name in booth.rig.cameras:
                 folder = out_folder / PROCEDURE / step / name

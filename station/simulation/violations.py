@@ -179,6 +179,22 @@ def bow_m(switches: frozenset[str], seed: int, x: Array, y: Array) -> Array:
     return np.asarray(float(rng.choice([-1.0, 1.0])) * _BOW_M * (shape + 0.15 * across**2))
 
 
+_HOOK_M, _HOOK_HEIGHT_M, _SWING_M = 1.5e-3, 2.45, (5e-4, 4e-3)
+"""Largest shift of the string along its hook from one height to another; the hook's height; ends of
+the amplitude with which a hanging ball still swings."""
+_GRAVITY_M_S2 = 9.81
+
+
+def hung_m(seed: int, stated_mm: int, height_m: float, time_s: float) -> Array:
+    """x, y (2,) of a ball's centre from below the hook on which it hangs."""
+    rng = _rng(seed, 8, stated_mm)
+    shift = rng.uniform(-_HOOK_M, _HOOK_M, 2)
+    turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    rate = np.sqrt(_GRAVITY_M_S2 / (_HOOK_HEIGHT_M - height_m))
+    swing = rng.uniform(*_SWING_M) * np.sin(rate * time_s + phase)
+    return np.asarray(shift + swing * np.array([np.cos(turn), np.sin(turn)]))
+
+
 _ZERO_PLANE_M, _PIXEL_MM, _EMITTER_CM = 1.2, 0.1042, 7.5
 """libfreenect's zero-plane constants: reference distance, pixel size and baseline."""
 

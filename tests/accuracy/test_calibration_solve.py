@@ -21,6 +21,7 @@ from station.core.rig import Rig
 from station.simulation import violations
 from station.simulation.procedure import VirtualProcedure
 from station.simulation.scene import load_mesh
+from station.simulation.sensor import SimulatedBooth
 
 BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 RATE_HZ = 9.0
@@ -35,9 +36,9 @@ def procedure() -> VirtualProcedure:
 class _OnABox(VirtualProcedure):
     """The ball on the floor to the left of the mark lies on a box."""
 
-    def resting_m(self, step: str) -> NDArray[np.float64]:
+    def resting_m(self, step: str, time_s: float) -> NDArray[np.float64]:
         box_m = np.array([0.0, 0.0, 0.01 if step == "around-0" else 0.0])
-        return super().resting_m(step) + box_m
+        return super().resting_m(step, time_s) + box_m
 
 
 @pytest.fixture(scope="module")
@@ -322,8 +323,35 @@ def test_a_stand_that_was_measured_wrongly_is_refused(
     around = dict(seen.around)
     stands = {round(mm, -2): around.pop(f"stand-{round(mm, -2)}") for mm in (900, 1700)}
     around |= {f"stand-{mm}": stands[round(mm, -2)] for mm in stated_mm}
-    with pytest.raises(CalibrationError, match=r"the ball on the stand of .* too low"):
+    with pytest.raises(CalibrationError, match=r"the ball at the height of .* too low"):
         solved(procedure.booth.rig, replace(seen, around=around))
+
+
+class _MovedHook(VirtualProcedure):
+    """The hook moved by 20 mm between the two heights at which the ball hung."""
+
+    def resting_m(self, step: str, time_s: float) -> NDArray[np.float64]:
+        moved_m = np.array([0.02 if step == "hanging-1700" else 0.0, 0.0, 0.0])
+        return super().resting_m(step, time_s) + moved_m
+
+
+def _hanging(booth: SimulatedBooth, kind: type[VirtualProcedure]) -> Observations:
+    return synthetic.observations(
+        kind(booth, hanging=True), rate_hz=RATE_HZ, boards=True, stands=True
+    )
+
+
+def test_a_hanging_ball_shows_what_is_vertical() -> None:
+    """With the ball on a stand, the world was tilted by 0.21 degrees, stated as 0.06."""
+    booth = synthetic.booth(825, switches=violations.ALL)
+    solution = solved(booth.rig, _hanging(booth, VirtualProcedure))
+    assert distortion(booth, solution.rig, load_mesh(BODY)).tilt_deg < 0.15
+
+
+def test_a_hook_that_moved_is_refused(procedure: VirtualProcedure) -> None:
+    booth = procedure.booth
+    with pytest.raises(CalibrationError, match=r"hanging ball's places are (19|20|21) mm"):
+        solved(booth.rig, _hanging(booth, _MovedHook))
 
 
 def test_a_ball_of_another_radius_is_refused(

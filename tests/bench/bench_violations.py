@@ -54,9 +54,9 @@ CASES: dict[str, tuple[str, ...]] = {
 _DIRECT = [name for name in CASES if name != "hand, helper"]
 
 
-def observe(booth: SimulatedBooth, images: bool) -> Observations:
-    """A booth's detections."""
-    procedure = VirtualProcedure(booth)
+def observe(booth: SimulatedBooth, *, images: bool, hanging: bool) -> Observations:
+    """A booth's detections; ``hanging``: the ball hangs where it stands on a stand otherwise."""
+    procedure = VirtualProcedure(booth, hanging=hanging)
     if not images:
         return synthetic.observations(procedure, boards=True, stands=True)
     cameras = synthetic.factory(booth.rig)
@@ -81,15 +81,15 @@ class Verdict:
     """A body scanned in this booth."""
 
 
-def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) -> Verdict:
+def judge(
+    name: str, booth: SimulatedBooth, seen: Observations, model: BodyModel | None = None
+) -> Verdict:
     """One booth's row of the table; a body is scanned in it if there is a model."""
-    booth = synthetic.booth(seed, switches=CASES[name])
-    seen = observe(booth, images)
     start_s = time.process_time()
     try:
         solution = solved(booth.rig, seen)
     except CalibrationError as refusal:
-        return Verdict(name, f"{name:<20}{seed:>4}  refused: {refusal}")
+        return Verdict(name, f"{name:<20}{booth.seed:>4}  refused: {refusal}")
     seconds = time.process_time() - start_s
     shifts = 1e3 * np.linalg.norm(pair_errors(booth.rig, solution.world_poses)[:, 3:], axis=1)
     unknowns = 6 * (len(booth.rig.cameras) - 1)
@@ -118,7 +118,7 @@ def judge(name: str, seed: int, images: bool, model: BodyModel | None = None) ->
     )
     middle_mm = float(found.girths_mm[len(girths) // 2])
     words = (
-        f"{name:<20}{seed:>4}{np.mean(shifts):7.2f}{np.max(shifts):6.1f}{chi2:7.2f}"
+        f"{name:<20}{booth.seed:>4}{np.mean(shifts):7.2f}{np.max(shifts):6.1f}{chi2:7.2f}"
         f"{found.normal_rms_mm:7.2f} ({1e3 * predicted.normal_rms_m:.2f})"
         f"{found.tilt_deg:7.3f} ({tilt_sigma_deg:.3f})"
         f"{found.height_mm:7.2f} ({1e3 * predicted.height_sigma_m:.2f})"
@@ -197,6 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=1, help="seed of the first booth")
     parser.add_argument("--case", action="append", choices=list(CASES), help="only these")
     parser.add_argument("--images", action="store_true", help="find the ball in rendered images")
+    parser.add_argument("--hanging", action="store_true", help="the ball hangs, without a stand")
     parser.add_argument("--scans", action="store_true", help="scan and measure a body in each")
     given = parser.parse_args(arguments)
     model = warm_up() if given.scans else None
@@ -209,7 +210,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verdicts = []
     for name in cases:
         for seed in range(given.first, given.first + given.seeds):
-            verdicts.append(judge(name, seed, given.images, model))
+            booth = synthetic.booth(seed, switches=CASES[name])
+            seen = observe(booth, images=given.images, hanging=given.hanging)
+            verdicts.append(judge(name, booth, seen, model))
             print(verdicts[-1].words, flush=True)
     summary(verdicts)
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import patch
 
-from station.calibration.detect.detections import EMPTY
+from station.calibration.detect.detections import EMPTY, HANGING
 from station.calibration.guide import procedure as guided
 from station.calibration.guide import steps
 from station.calibration.guide.operator import Guide
@@ -33,8 +33,9 @@ _WORDS_A_S = 4.0
 _WALK_S = 4.0
 """From the mark to the keyboard, 4 m; the way back is within the countdown."""
 _ANSWER_S = 2.0
-_FETCH_S = {"stand": 15.0, "board": 10.0}
-"""To put up the stand or to move the board; the ball is laid in the countdown."""
+_FETCH_S = {"stand": 15.0, "hook": 20.0, "board": 10.0}
+"""To put up the stand, to hang the ball (it comes to rest meanwhile, and on the way back), or to
+move the board; the ball is laid in the countdown."""
 
 
 class _NoFeed:
@@ -54,28 +55,32 @@ class _NoFeed:
 class Operator:
     """Somebody who reads everything and does all that is wanted."""
 
-    stands_m: list[float]
+    raised_m: list[float]
     boards: int
+    hangs: bool
     spent_s: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
     def read(self, text: str, **_: object) -> None:
         self.spent_s["reading"] += len(text.split()) / _WORDS_A_S
 
     def prompt(self, text: str, **_: object) -> float | str:
-        """Enter before a step, or the height of a stand."""
+        """Enter before a step, or the height of the ball."""
         self.read(text)
         if "Enter" in text:
             self.spent_s["walking to the keyboard"] += _WALK_S
             return ""
-        if not self.stands_m:
+        if not self.raised_m:
             self.spent_s["answers"] += _ANSWER_S
             return 0.0
-        self._fetch("stand")
-        return self.stands_m.pop(0)
+        self._fetch("hook" if self.hangs else "stand")
+        return self.raised_m.pop(0)
 
     def confirm(self, text: str, **_: object) -> bool:
-        """Is the board there?"""
+        """Is the board there, or does the ball hang?"""
         self.read(text)
+        if "hang" in text:
+            self.spent_s["answers"] += _ANSWER_S
+            return self.hangs
         self.boards -= 1
         if self.boards >= 0:
             self._fetch("board")
@@ -85,7 +90,7 @@ class Operator:
 
     def _fetch(self, what: str) -> None:
         """Put it up, come back to the keyboard and say so."""
-        self.spent_s["stand and board"] += _FETCH_S[what]
+        self.spent_s["ball and board"] += _FETCH_S[what]
         self.spent_s["walking to the keyboard"] += _WALK_S
         self.spent_s["answers"] += _ANSWER_S
 
@@ -101,16 +106,24 @@ class Operator:
         return looked
 
 
-def procedure_seconds(*, extras: bool) -> dict[str, float]:
-    """Seconds of each kind; ``extras``: with the stand's and the board's places that the simulated
-    procedure has, without which heights and depths are known less well."""
+def procedure_seconds(*, extras: bool, hangs: bool = False) -> dict[str, float]:
+    """Seconds of each kind; ``extras``: with the ball's heights and the board's places that the
+    simulated procedure has, without which heights and depths are known less well; ``hangs``: the
+    ball hangs at these heights."""
     virtual, wanted = VirtualProcedure(), CalibrateConfig()
     operator = Operator(
-        list(virtual.stand_m[::-1]) if extras else [], len(virtual.board_at_m) if extras else 0
+        list(virtual.raised_m[::-1]) if extras else [],
+        len(virtual.board_at_m) if extras else 0,
+        hangs,
     )
-    rest_s = steps._RESTING_DETECTIONS / INDEPENDENT_HZ + steps._OTHERS_S
+
+    def rest(*given: object) -> None:
+        hanging = str(given[-1]).startswith(HANGING)
+        count = steps._HANGING_DETECTIONS if hanging else steps._RESTING_DETECTIONS
+        operator.look(count / INDEPENDENT_HZ + steps._OTHERS_S)()
+
     session = SimpleNamespace(
-        done=lambda step: step == EMPTY, around_count=0, stand_count=0, wall_count=0
+        done=lambda step: step == EMPTY, around_count=0, raised=[], wall_count=0
     )
     config = SimpleNamespace(calibrate=wanted, reference="")
     sessions = chain([None], repeat(session))
@@ -124,7 +137,7 @@ def procedure_seconds(*, extras: bool) -> dict[str, float]:
             guided,
             look_at_empty_booth=operator.look(steps._EMPTY_FRAMES / FRAME_RATE_HZ),
             look_at_wall=operator.look(steps._WALL_FRAMES / FRAME_RATE_HZ),
-            rest_ball=operator.look(rest_s),
+            rest_ball=rest,
             wave_ball=operator.look(wanted.waving_s),
             coverage_so_far=lambda *_: SimpleNamespace(enough=False),
         ),
@@ -145,8 +158,12 @@ def procedure_seconds(*, extras: bool) -> dict[str, float]:
 def print_procedure() -> None:
     """The bar, with and without what is offered beyond ball, mark and floor."""
     print("\nprocedure of one person (people's times assumed, the guide's own steps)")
-    for extras, name in ((False, "ball, mark, floor"), (True, "with stand and board")):
-        spent_s = procedure_seconds(extras=extras)
+    for extras, hangs, name in (
+        (False, False, "ball, mark, floor"),
+        (True, False, "with stand and board"),
+        (True, True, "with hook and board"),
+    ):
+        spent_s = procedure_seconds(extras=extras, hangs=hangs)
         total_s = sum(spent_s.values())
         parts = ", ".join(f"{what} {seconds:.0f}" for what, seconds in spent_s.items())
         verdict = "met" if total_s <= BAR_S else "MISSED"

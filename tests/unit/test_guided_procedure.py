@@ -112,20 +112,24 @@ def test_a_board_that_is_not_there_ends_the_step(
     assert sum(seconds) == 5 * COUNTDOWN_S / 2
 
 
-def test_two_heights_of_a_stand_are_asked_for(
+@pytest.mark.parametrize("hangs", [False, True], ids=["stand", "hanging"])
+def test_two_heights_of_the_ball_are_asked_for(
     guided: tuple[Procedure, Session, list[str]],
     seconds: list[float],
     monkeypatch: pytest.MonkeyPatch,
+    hangs: bool,
 ) -> None:
     """It asked for one more height until somebody entered 0; the second one is not left out, for it
     shows that the first was measured wrongly."""
     begun, session, looked = guided
-    heights_m = [1.7, 0.9]
+    heights_m = [1.7, 0.0, 0.9]
+    _answers(monkeypatch, [hangs])
     monkeypatch.setattr(click, "prompt", lambda *_, **__: heights_m.pop(0))
-    begun.stands()
-    begun.stands()
-    assert looked == ["stand-1700", "stand-900"]
-    assert session.stand_count == 2
+    for _ in range(3):
+        begun.raised()
+    kind = "hanging" if hangs else "stand"
+    assert looked == [f"{kind}-1700", f"{kind}-900"]
+    assert session.raised == looked
     assert sum(seconds) == COUNTDOWN_S
 
 
@@ -135,8 +139,9 @@ def test_no_stand_is_asked_about_once(
 ) -> None:
     begun, _, looked = guided
     answers = [0.0, 1.7]
+    _answers(monkeypatch, [False])
     monkeypatch.setattr(click, "prompt", lambda *_, **__: answers.pop(0))
-    begun.stands()
+    begun.raised()
     assert answers == [1.7]
     assert looked == []
 

@@ -3,14 +3,21 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from station.calibration.adjust.problem import State
+from station.calibration.adjust.problem import Doubt, Problem, State
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import FLOOR, BallDetection, Observations
+from station.calibration.detect.detections import (
+    FLOOR,
+    BallDetection,
+    Observations,
+    raised_height_m,
+)
 from station.calibration.solve import jumps, refusals
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections, sorted_detections, without_gaps
@@ -74,6 +81,13 @@ def world(
     )
 
 
+def places(*names: str) -> Problem:
+    """A problem of which only the resting ball's places are known."""
+    heights_m = {name: height for name in names if (height := raised_height_m(name)) is not None}
+    resting = dict.fromkeys(names, ())
+    return cast(Problem, SimpleNamespace(resting=resting, heights_m=heights_m))
+
+
 def tracks() -> dict[str, Detections]:
     return {name: Detections((), Track(np.zeros(0), np.zeros((0, 3)))) for name in NAMES[:2]}
 
@@ -128,10 +142,18 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_predicted, predicted(1e-3, 5e-3), LIMITS, coverage(0), False, False
     ),
     "the floor's slope is only known to within 0.29 degrees: lay the ball to the left": partial(
-        refusals.check_slope, world(slope_sigma_rad=5e-3), False
+        refusals.check_slope, places(), world(slope_sigma_rad=5e-3)
+    ),
+    "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
+        refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
     "0.29 degrees: lay the ball at more places on the floor around the mark": partial(
-        refusals.check_slope, world(slope_sigma_rad=5e-3), True
+        refusals.check_slope,
+        places("around-0", "hanging-400", "hanging-1700"),
+        world(slope_sigma_rad=5e-3),
+    ),
+    "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
+        refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])
     ),
     f"camera {NAMES[0]} would be 0.50 m below the floor": partial(
         refusals.check_upright, world(height_m=-0.5)
@@ -174,7 +196,7 @@ def test_what_is_sound_passes() -> None:
     refusals.check_converged(state())
     refusals.check_held_out({NAMES[0]: HeldOut(100, 2e-3, np.zeros(3))})
     refusals.check_predicted(predicted(1e-3, 1e-3), LIMITS, coverage(0), False, False)
-    refusals.check_slope(world(), False)
+    refusals.check_slope(places(), world())
     refusals.check_upright(world())
     refusals.check_mark(world(), RADIUS_M)
     assert refusals.check_radius([ball()] * 3, RADIUS_M) == RADIUS_M

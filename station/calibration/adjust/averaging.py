@@ -80,9 +80,7 @@ def averaged_state(problem: Problem, state: State) -> State:
     doubts = []
     for belief in doubtful:
         probability, step = mixture.share(belief)
-        off_m = dict(zip(contacts.places, contacts.off_m + contacts.rows @ step, strict=True))
-        there_m = float(np.mean([off_m[place] for place in belief.wrong]))
-        doubts.append(Doubt(belief.wrong, probability, there_m))
+        doubts.append(Doubt(belief.wrong, probability, contacts.size_m(belief, step)))
     mean, covariance = mixture.moments()
     return replace(
         moved_state(problem, layout, state, mean),

@@ -248,7 +248,7 @@ class NormalEquations:
         )
 
     def _add_contacts(self) -> None:
-        """The ball rests on the floor, or on a stand of measured height above it."""
+        """The ball rests on the floor or at a measured height above it, or hangs plumb."""
         contacts = Contacts.of(self._problem, self._layout, self._state)
         weighed = contacts.rows * contacts.weight[:, None]
         self._border += contacts.rows.T @ weighed

@@ -136,12 +136,12 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Probability that people were wrong about the height of some places of the ball."""
+    """Probability that people were wrong about some places of the ball."""
 
     places: tuple[str, ...]
     probability: float
     off_m: float
-    """Height of the ball there above what people said, if so."""
+    """Height of the ball there above what people said, or distance from the plumb line, if so."""
 
 
 @dataclass(frozen=True)

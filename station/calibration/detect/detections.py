@@ -22,11 +22,13 @@ from station.sensors.base import DeviceInfo
 
 Array = NDArray[np.float64]
 
-EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND = (
-    "empty", "ball", "mark", "front", "wall", "around", "stand",
+EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND, HANGING = (
+    "empty", "ball", "mark", "front", "wall", "around", "stand", "hanging",
 )  # fmt: skip
 """Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
-"stand-1700" by the height in millimetres."""
+"stand-1700" and "hanging-1700" by the height in millimetres."""
+RAISED = (STAND, HANGING)
+"""Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
 FLOOR = "floor"
 _FEWEST_PATCHES = 3
 """Fewer do not make a plane."""
@@ -40,11 +42,11 @@ _WHOLE_SIGMA_PER_M = 3.8e-5
 `station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
 
 
-def stand_height_m(step: str) -> float | None:
-    """Stated height of the stand in a step's name, metres; None: the step has no stand."""
-    if not step.startswith(STAND):
+def raised_height_m(step: str) -> float | None:
+    """Stated height of the raised ball in a step's name, metres; None: it is not raised there."""
+    if not step.startswith(RAISED):
         return None
-    return 1e-3 * float(step.removeprefix(f"{STAND}-"))
+    return 1e-3 * float(step.partition("-")[2])
 
 
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:

@@ -212,19 +212,26 @@ def around(procedure: Procedure) -> None:
     required=True,
     help="of the ball's underside above the floor, metres, measured to 1 mm",
 )
+@click.option(
+    "--hanging", is_flag=True, help="the ball hangs on a string, from the same hook at each height"
+)
 @_step
-def stand(procedure: Procedure, height_m: float) -> None:
-    """Look at the ball on a stand of measured height on the mark: the scale of all heights.
+def stand(procedure: Procedure, height_m: float, hanging: bool) -> None:
+    """Look at the ball at a measured height above the mark: the scale of all heights.
 
-    One as high as a head makes heights accurate; one half as high shows whether it was measured
-    rightly.
+    One as high as a head makes heights accurate; a lower one shows whether it was measured
+    rightly. The ball stands on a stand, or it hangs on a string: from one and the same hook at two
+    heights, it also shows what is vertical.
 
     \b
     Examples:
       station calibrate stand --height 0.9
       station calibrate stand --height 1.7
+      station calibrate stand --height 0.4 --hanging
     """
-    procedure.stand(height_m)
+    from station.calibration.detect.detections import HANGING, STAND
+
+    procedure.raise_ball(height_m, HANGING if hanging else STAND)
 
 
 @calibrate.command("depth")

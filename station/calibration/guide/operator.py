@@ -85,17 +85,17 @@ class Guide:
         """The step is over: the operator may move again."""
         self.say(f"{text}{_BELL if self.attended else ''}")
 
-    def answers_yes(self, question: str) -> bool:
-        """Ask whether the operator wants one more; no when nobody is there."""
+    def answers_yes(self, question: str, *, usual: bool = True) -> bool:
+        """Ask the operator, whose Enter alone is the usual answer; no when nobody is there."""
         self.end_line()
-        return self.attended and click.confirm(f"  {question}", default=True)
+        return self.attended and click.confirm(f"  {question}", default=usual)
 
     def height_m(self, question: str) -> float | None:
-        """The measured height of a stand, metres; None when there is none or nobody to ask."""
+        """The measured height of the ball, metres; None when there is none or nobody to ask."""
         self.end_line()
         if not self.attended:
             return None
-        answer = click.prompt(f"  {question} Metres (0: no stand)", type=_HEIGHT, default=0.0)
+        answer = click.prompt(f"  {question} Metres (0: leave out)", type=_HEIGHT, default=0.0)
         return float(answer) or None
 
     def end_line(self) -> None:

@@ -8,7 +8,17 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.calibration.detect.detections import AROUND, BALL, EMPTY, FRONT, MARK, STAND, WALL
+from station.calibration.detect.detections import (
+    AROUND,
+    BALL,
+    EMPTY,
+    FRONT,
+    HANGING,
+    MARK,
+    RAISED,
+    STAND,
+    WALL,
+)
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import SESSION, Session
@@ -24,23 +34,34 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
 
-_STEPS = (EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND)
+_STEPS = (EMPTY, BALL, MARK, FRONT, WALL, AROUND, *RAISED)
 _SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
 _SURE_OF_RADIUS = 60
 """Sightings from which on a ball of another radius is told."""
 _BOARDS = 3
 """Places of the board that a calibration asks for; a fourth buys next to nothing."""
-_STAND_M = (0.3, 2.2)
-"""Heights of a stand that cameras of a booth see."""
+_RAISED_M = (0.3, 2.2)
+"""Heights of the ball that cameras of a booth see."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
 """Places of the ball: three that are not on one line show the floor's slope both ways."""
-_STANDS = (
-    "Put the ball on a stand on the mark, best as high as a head, for more accurate heights. How "
-    "high is its underside above the floor?",
-    "Now about half as high: a wrong measurement shows. How high is its underside?",
+_HOOK = (
+    "For accurate heights, the ball stands on a stand, or hangs on a string from a hook above the "
+    "mark and also shows what is vertical. Does it hang?"
 )
-"""A question for each height of the stand."""
+_HEIGHTS = {
+    STAND: (
+        "Put the ball on a stand on the mark, best as high as a head. How high is its underside "
+        "above the floor?",
+        "Now about half as high: a wrong measurement shows. How high is its underside?",
+    ),
+    HANGING: (
+        "Hang the ball as high as a head, and wait until it hangs still. How high is its underside "
+        "above the floor?",
+        "Now as low as a knee, from the same hook, and still. How high is its underside?",
+    ),
+}
+"""A question for each height of the ball."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +131,7 @@ class Procedure:
             self.rest(FRONT)
         if session is None or session.around_count < len(_AROUND):
             self.around(asked=True)
-        self.stands()
+        self.raised()
         if session is None or session.wall_count < _BOARDS:
             self.walls(asked=True)
         self.solve()
@@ -192,38 +213,51 @@ class Procedure:
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
 
-    def stands(self) -> None:
-        """The ball on a stand, at two heights that the operator gives; at all that are recorded."""
+    def raised(self) -> None:
+        """The ball at two measured heights that the operator gives; at all that are recorded."""
         if self.recordings is not None:
-            for folder in sorted(self.recordings.glob(f"{STAND}-*")):
-                millimetres = folder.name.removeprefix(f"{STAND}-")
-                self.stand(1e-3 * int(millimetres) if millimetres.isdecimal() else float("nan"))
+            for folder in sorted(self.recordings.glob("*-*")):
+                if folder.name.startswith(RAISED):
+                    kind, _, millimetres = folder.name.partition("-")
+                    known = millimetres.isdecimal()
+                    self.raise_ball(1e-3 * int(millimetres) if known else float("nan"), kind)
             return
         session = self._session_to_add_to()
-        before = session.stand_count if session else 0
-        if self.guide.attended and before < len(_STANDS):
-            self.guide.title("Ball on a stand")
-        for question in _STANDS[before:]:
+        before = session.raised if session else []
+        if len(before) >= len(_HEIGHTS[STAND]) or not self.guide.attended:
+            return
+        self.guide.title("Ball at two heights")
+        hangs = (
+            before[0].startswith(HANGING) if before else self.guide.answers_yes(_HOOK, usual=False)
+        )
+        kind = HANGING if hangs else STAND
+        for question in _HEIGHTS[kind][len(before) :]:
             if (height_m := self.guide.height_m(question)) is None:
                 return
-            self.stand(height_m, ready=True)
+            self.raise_ball(height_m, kind, ready=True)
 
-    def stand(self, height_m: float, *, ready: bool = False) -> None:
-        """The ball on a stand, its underside at a measured height above the floor.
+    def raise_ball(self, height_m: float, kind: str, *, ready: bool = False) -> None:
+        """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
+        the floor.
 
-        ``ready``: it stands there already.
+        ``ready``: it is there already.
         """
-        if not _STAND_M[0] <= height_m <= _STAND_M[1]:
+        if not _RAISED_M[0] <= height_m <= _RAISED_M[1]:
             raise CalibrationError(
-                f"a stand of {height_m:g} m cannot be used: its height is in metres, 0.3 to 2.2"
+                f"a ball at {height_m:g} m cannot be used: its height is in metres, 0.3 to 2.2"
             )
-        step = f"{STAND}-{round(1e3 * height_m)}"
+        step = f"{kind}-{round(1e3 * height_m)}"
         if ready:
             self.guide.count_down()
             self._see_at_rest(step)
         else:
-            where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
-            self._lay(step, f"Ball {where}", "Put it up and step back.")
+            if kind == HANGING:
+                where = f"hanging above the mark, its underside {height_m:g} m above the floor"
+                instruction = "Wait until it hangs still, and step back."
+            else:
+                where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
+                instruction = "Put it up and step back."
+            self._lay(step, f"Ball {where}", instruction)
 
     def walls(self, asked: bool) -> None:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are

@@ -23,12 +23,12 @@ from station.calibration.detect.detections import (
     EMPTY,
     FRONT,
     MARK,
-    STAND,
+    RAISED,
     WALL,
     BallDetection,
     Observations,
     PlaneObservation,
-    stand_height_m,
+    raised_height_m,
 )
 from station.calibration.detect.scene import StaticView
 from station.core.errors import CalibrationError, FormatError
@@ -185,7 +185,7 @@ class Session:
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
             f"{self.around_count} places around it": bool(self.around_count),
-            f"{self.stand_count} heights of the stand": bool(self.stand_count),
+            f"{len(self.raised)} measured heights of the ball": bool(self.raised),
             f"{self.wall_count} boards": self.done(WALL),
         }
         return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
@@ -209,9 +209,9 @@ class Session:
         return sum(place.startswith(AROUND) for place in self.around)
 
     @property
-    def stand_count(self) -> int:
-        """Heights of the stand at which the ball was seen."""
-        return len(self.around) - self.around_count
+    def raised(self) -> list[str]:
+        """Steps in which the ball was seen at a measured height."""
+        return [place for place in self.around if place.startswith(RAISED)]
 
     @property
     def wall_count(self) -> int:
@@ -290,8 +290,8 @@ class Session:
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
-        elif step.startswith((AROUND, STAND)):
-            for other in [name for name in self.around if _same_stand(name, step)]:
+        elif step.startswith((AROUND, *RAISED)):
+            for other in [name for name in self.around if _same_height(name, step)]:
                 del self.around[other]
             self.around[step] = self._balls(entry)
         elif step == "board":
@@ -325,9 +325,9 @@ class Session:
         return self._later_s
 
 
-def _same_stand(step: str, other: str) -> bool:
-    """Whether both are one height of the stand, of which the first was measured wrongly."""
-    first_m, second_m = stand_height_m(step), stand_height_m(other)
+def _same_height(step: str, other: str) -> bool:
+    """Whether both are one height of the ball, of which the first was measured wrongly."""
+    first_m, second_m = raised_height_m(step), raised_height_m(other)
     if first_m is None or second_m is None:
         return False
     return abs(first_m - second_m) < _SAME_STAND_M

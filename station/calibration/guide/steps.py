@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import BallDetection, PlaneObservation
+from station.calibration.detect.detections import HANGING, BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import smoothed, static_view
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
@@ -23,6 +23,8 @@ _EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
 _RESTING_DETECTIONS = 12
+_HANGING_DETECTIONS = 60
+"""Three seconds: more than a swing of a string of 2 m."""
 _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
 _OTHERS_S = 3.0
@@ -116,6 +118,8 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     Raises:
         CalibrationError: it was not seen at rest.
     """
+    # What still swings a little is averaged over more than a swing.
+    count = _HANGING_DETECTIONS if step.startswith(HANGING) else _RESTING_DETECTIONS
     recent: dict[str, list[BallDetection]] = {name: [] for name in session.cameras}
     still: dict[str, list[BallDetection]] = {}
     now_s = time.monotonic()
@@ -125,29 +129,29 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
             finder.submit(feed.newest())
             for ball in finder.found():
                 recent[ball.camera].append(ball)
-            still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
+            still = {name: seen for name, seen in recent.items() if _at_rest(seen, count)}
             guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
             now_s = time.monotonic()
             if still:
                 settled_s = min(settled_s, now_s + _OTHERS_S)
         for ball in finder.found(wait=True):
             recent[ball.camera].append(ball)
-    still = {name: seen for name, seen in recent.items() if _at_rest(seen)}
+    still = {name: seen for name, seen in recent.items() if _at_rest(seen, count)}
     if not still:
         raise CalibrationError(
             "no camera sees the ball at rest: put it down where the lower cameras see it, take "
             "your hands away, and check that its radius is "
             f"{session.radius_m:g} m (calibrate.ball_radius_m)"
         )
-    kept = [ball for seen in still.values() for ball in seen[-_RESTING_DETECTIONS:]]
+    kept = [ball for seen in still.values() for ball in seen[-count:]]
     session.record_resting(step, kept)
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
 
 
-def _at_rest(seen: list[BallDetection]) -> bool:
-    if len(seen) < _RESTING_DETECTIONS:
+def _at_rest(seen: list[BallDetection], count: int) -> bool:
+    if len(seen) < count:
         return False
-    centers = np.array([ball.center_m for ball in seen[-_RESTING_DETECTIONS:]])
+    centers = np.array([ball.center_m for ball in seen[-count:]])
     away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     return bool(np.median(away) < _RESTING_M)
 

@@ -8,10 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.contacts import PLUMB, plumb_ends
 from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import FRONT, MARK, BallDetection, Observations
+from station.calibration.detect.detections import (
+    AROUND,
+    FRONT,
+    MARK,
+    BallDetection,
+    Observations,
+)
 from station.calibration.solve import jumps
 from station.calibration.solve.acceptance import HeldOut, resting_offsets
 from station.calibration.solve.initial import Detections
@@ -46,6 +53,10 @@ _LARGEST_SLOPE_RAD = np.radians(0.15)
 SIGMAS_95 = 1.96
 _START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
+HANGING_WORDS = (
+    "hang the ball from one and the same hook at two heights, and let it come to rest (station "
+    "calibrate stand --hanging --height 0.4, then --height 1.7)"
+)
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
     "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
@@ -207,9 +218,11 @@ def remedy(done: bool, step: str) -> str:
     return "wave the ball longer" if done else f"{step}, and wave the ball longer"
 
 
-def slope_words(laid: bool) -> str:
-    """Advice against a doubtful slope; ``laid``: the ball was laid around the mark already."""
-    return _MORE_AROUND_WORDS if laid else AROUND_WORDS
+def slope_words(problem: Problem) -> str:
+    """Advice against a doubtful slope: of what helps, the next that was not done."""
+    if not any(place.startswith(AROUND) for place in problem.resting):
+        return AROUND_WORDS
+    return HANGING_WORDS if plumb_ends(problem) is None else _MORE_AROUND_WORDS
 
 
 def check_predicted(
@@ -230,16 +243,16 @@ def check_predicted(
             )
 
 
-def check_slope(world_poses: WorldPoses, laid: bool) -> None:
+def check_slope(problem: Problem, world_poses: WorldPoses) -> None:
     if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         raise CalibrationError(
             "the floor's slope is only known to within "
-            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {slope_words(laid)}"
+            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {slope_words(problem)}"
         )
 
 
 def check_doubts(problem: Problem, state: State) -> None:
-    """Refuse a stand of another height than was said, or a ball on a box.
+    """Refuse a ball that was not where it was said to be: at a height, plumb, on the floor.
 
     Without a stand and a visible floor, one box tilts the world.
     """
@@ -249,10 +262,16 @@ def check_doubts(problem: Problem, state: State) -> None:
     if worst.places[0] in problem.heights_m:
         heights = ", ".join(f"{problem.heights_m[place]:.3f}" for place in worst.places)
         raise CalibrationError(
-            f"the ball on the stand of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
+            f"the ball at the height of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
             f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
             "the floor again, and repeat that step (station calibrate stand --height ...); if it "
             "was right, let the sensors warm up and wave the ball again"
+        )
+    if worst.places == (PLUMB,):
+        raise CalibrationError(
+            f"the hanging ball's places are {1e3 * worst.off_m:.0f} mm from above one another: "
+            f"{HANGING_WORDS}; if it did hang so, take away what lay under the ball on the floor, "
+            "and start again with station calibrate --new"
         )
     raise CalibrationError(
         "the places of the ball on the floor do not lie on one floor (one is "

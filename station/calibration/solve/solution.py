@@ -22,13 +22,12 @@ from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import (
-    AROUND,
     FLOOR,
     FRONT,
     MARK,
     WALL,
     Observations,
-    stand_height_m,
+    raised_height_m,
 )
 from station.calibration.solve import acceptance, refusals, world
 from station.calibration.solve.acceptance import HeldOut
@@ -181,7 +180,7 @@ def solve(
         refusals.check_solved_radius(problem, state)
         refusals.check_unmoved(problem, state)
         refusals.check_doubts(problem, state)
-        refusals.check_slope(world_poses, _laid(problem))
+        refusals.check_slope(problem, world_poses)
         refusals.check_mark(world_poses, radius_m)
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
@@ -224,16 +223,12 @@ def _advice(
     if not _boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
-        weak.append(f"for the floor's slope, {refusals.slope_words(_laid(problem))}")
+        weak.append(f"for the floor's slope, {refusals.slope_words(problem)}")
     return tuple(weak)
 
 
 def _boarded(problem: Problem) -> bool:
     return any(surface.surface.startswith(WALL) for surface in problem.surfaces)
-
-
-def _laid(problem: Problem) -> bool:
-    return any(place.startswith(AROUND) for place in problem.resting)
 
 
 def _tested(
@@ -292,7 +287,7 @@ def _problem(
         )
     refusals.check_front(resting_places(resting, poses))
     heights_m = {
-        place: height_m for place in resting if (height_m := stand_height_m(place)) is not None
+        place: height_m for place in resting if (height_m := raised_height_m(place)) is not None
     }
     surfaces = named_surfaces(observations.planes, cameras, poses)
     if not any(surface.surface == FLOOR for surface in surfaces):

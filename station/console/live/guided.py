@@ -61,7 +61,8 @@ class PageGuide(Guide):
     def done(self, text: str) -> None:
         self._say("done", text=text)
 
-    def answers_yes(self, question: str) -> bool:
+    def answers_yes(self, question: str, *, usual: bool = True) -> bool:
+        del usual  # The page has two buttons.
         if not self.attended:
             return False
         self._say("question", text=question)
@@ -104,7 +105,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "around":
                 procedure.around(asked=False)
             case "stand":
-                procedure.stands()
+                procedure.raised()
             case "depth":
                 procedure.walls(asked=False)
             case "solve":

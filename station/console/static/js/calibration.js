@@ -65,7 +65,7 @@ export async function calibration(main, session) {
         task.waits_for === 'go' ? h('button', { className: 'primary', onclick: () => say('go') }, t('cal.go')) : '',
         task.waits_for === 'yes or no' ? h('button', { className: 'primary', onclick: () => say('yes') }, t('cal.yes')) : '',
         task.waits_for === 'yes or no' ? h('button', { onclick: () => say('no') }, t('cal.no')) : '',
-        task.waits_for === 'height' ? h('button', { id: 'no-stand', onclick: () => say('no') }, t('cal.noStand')) : '',
+        task.waits_for === 'height' ? h('button', { id: 'leave-out', onclick: () => say('no') }, t('cal.leaveOut')) : '',
         h('button', { className: 'danger', id: 'halt', onclick: halt }, t('cal.stop'))),
       task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, said(task.progress) || ' '), bar),
       h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, said(line)))));
