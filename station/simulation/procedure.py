@@ -70,7 +70,7 @@ class VirtualProcedure:
     @property
     def raised_m(self) -> tuple[float, ...]:
         """Stated heights of the ball's underside above the floor."""
-        return (0.4, 1.7) if self.hanging else (0.9, 1.7)
+        return (0.7, 1.8) if self.hanging else (0.9, 1.7)
 
     @property
     def steps(self) -> tuple[str, ...]:

@@ -331,7 +331,7 @@ class _MovedHook(VirtualProcedure):
     """The hook moved by 20 mm between the two heights at which the ball hung."""
 
     def resting_m(self, step: str, time_s: float) -> NDArray[np.float64]:
-        moved_m = np.array([0.02 if step == "hanging-1700" else 0.0, 0.0, 0.0])
+        moved_m = np.array([0.02 if step == "hanging-1800" else 0.0, 0.0, 0.0])
         return super().resting_m(step, time_s) + moved_m
 
 

@@ -34,7 +34,7 @@ _TAIL = 4.0
 _STAND_TAIL = 20.0
 """Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
 unexpected form must not push it aside."""
-_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.05
+_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.02
 """Odds against all being as was said, of something that lies under the ball at one place, of one
 height that was measured wrongly, of all heights being wrong by the same amount (measured with a
 tape whose hook is loose, or from a carpet), and of a hook that moved between two heights."""

@@ -26,7 +26,7 @@ EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND, HANGING = (
     "empty", "ball", "mark", "front", "wall", "around", "stand", "hanging",
 )  # fmt: skip
 """Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
-"stand-1700" and "hanging-1700" by the height in millimetres."""
+"stand-1700" and "hanging-1800" by the height in millimetres."""
 RAISED = (STAND, HANGING)
 """Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
 FLOOR = "floor"

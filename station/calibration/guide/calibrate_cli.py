@@ -227,7 +227,8 @@ def stand(procedure: Procedure, height_m: float, hanging: bool) -> None:
     Examples:
       station calibrate stand --height 0.9
       station calibrate stand --height 1.7
-      station calibrate stand --height 0.4 --hanging
+      station calibrate stand --height 1.8 --hanging
+      station calibrate stand --height 0.7 --hanging
     """
     from station.calibration.detect.detections import HANGING, STAND
 

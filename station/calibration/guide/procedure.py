@@ -56,9 +56,9 @@ _HEIGHTS = {
         "Now about half as high: a wrong measurement shows. How high is its underside?",
     ),
     HANGING: (
-        "Hang the ball as high as a head, and wait until it hangs still. How high is its underside "
-        "above the floor?",
-        "Now as low as a knee, from the same hook, and still. How high is its underside?",
+        "Hang the ball a little higher than a head, and wait until it hangs still. How high is its "
+        "underside above the floor?",
+        "Now as high as a table, from the same hook, and still. How high is its underside?",
     ),
 }
 """A question for each height of the ball."""

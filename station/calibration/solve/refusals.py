@@ -55,7 +55,7 @@ _START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
 HANGING_WORDS = (
     "hang the ball from one and the same hook at two heights, and let it come to rest (station "
-    "calibrate stand --hanging --height 0.4, then --height 1.7)"
+    "calibrate stand --hanging --height 1.8, then --height 0.7)"
 )
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
@@ -264,8 +264,9 @@ def check_doubts(problem: Problem, state: State) -> None:
         raise CalibrationError(
             f"the ball at the height of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
             f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
-            "the floor again, and repeat that step (station calibrate stand --height ...); if it "
-            "was right, let the sensors warm up and wave the ball again"
+            "the floor again, and repeat that step (station calibrate stand --height ..., with "
+            "--hanging where it hung); if it was right, let the sensors warm up and wave the ball "
+            "again"
         )
     if worst.places == (PLUMB,):
         raise CalibrationError(
