@@ -139,9 +139,9 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     still = {name: seen for name, seen in recent.items() if _at_rest(seen, count)}
     if not still:
         raise CalibrationError(
-            "no camera sees the ball at rest: put it down where the lower cameras see it, take "
-            "your hands away, and check that its radius is "
-            f"{session.radius_m:g} m (calibrate.ball_radius_m)"
+            "no camera sees the ball at rest: put it where a camera sees it (on the floor, a lower "
+            "one), take your hands away, wait until it hangs still if it hangs, and check that its "
+            f"radius is {session.radius_m:g} m (calibrate.ball_radius_m)"
         )
     kept = [ball for seen in still.values() for ball in seen[-count:]]
     session.record_resting(step, kept)
