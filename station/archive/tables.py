@@ -90,17 +90,18 @@ def printed_table(document: dict[str, Any]) -> list[str]:
     single = [row for row in listed if not row["side"]]
     lines = [f"{'':<{width}}  {'cm':>7}  95 % interval"]
     lines += [f"{row['words']:<{width}}  {_printed(row)}".rstrip() for row in single]
-    sides: dict[str, dict[str, str]] = {}
+    heading = {"left": f"{'left':>7}", "right": f"{'right':>7}"}
+    sides: dict[str, dict[str, str]] = {"": heading}
     for row in listed:
         if row["side"]:
             sides.setdefault(row["words"], {})[row["side"]] = _printed(row)
-    column = max((len(of.get("left", "")) for of in sides.values()), default=0)
-    if sides:
-        lines += ["", f"{'':<{width}}  {'left':>7}{'':<{max(0, column - 7)}}  {'right':>7}"]
-    lines += [
+    column = max(len(of.get("left", "")) for of in sides.values())
+    both = [
         f"{words:<{width}}  {of.get('left', ''):<{column}}  {of.get('right', '')}".rstrip()
         for words, of in sides.items()
     ]
+    if len(both) > 1:
+        lines += ["", *both]
     used = {row["basis"] for row in listed}
     notes = [f"{mark} {words}" for basis, (mark, words) in _MARKS.items() if basis in used]
     return [*lines, "", *notes] if notes else lines

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,13 +48,13 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     processes = {service.name: read_health(folder, service.name) for service in services(config)}
     problems = _silent(processes)
     sync = processes["sync"]
-    if not _reports(sync):
+    if not reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
     problems += _cameras(sync, wanted=bool(processes["control"].get("streaming")))
     problems += [
         str(problem)
         for content in processes.values()
-        if _reports(content)
+        if reports(content)
         for problem in content.get("problems", [])
     ]
     problems += problem_in_words(config)
@@ -61,14 +62,14 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
 
 
-def _reports(content: dict[str, Any]) -> bool:
+def reports(content: Mapping[str, Any]) -> bool:
     """A process's last report is fresh; what an older one says may have passed."""
     return bool(content) and content["age_s"] <= MAX_AGE_S
 
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
-    if not any(map(_reports, processes.values())):
+    if not any(map(reports, processes.values())):
         return [
             "no process of the booth is running here; start it with: station run, or an installed "
             "booth with: sudo systemctl start booth.target"
@@ -80,7 +81,7 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         else f"the {name} process is not running; see journalctl -u 'booth-*', or the "
         "terminal of station run"
         for name, content in processes.items()
-        if not _reports(content)
+        if not reports(content)
     ]
 
 

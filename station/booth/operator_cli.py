@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import MAX_AGE_S, booth_health
+from station.booth.health import booth_health, reports
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import config_option
 from station.core.config import BoothConfig, find_config, load_config
@@ -142,9 +142,8 @@ def _show_status(content: Mapping[str, Any]) -> None:
     if any(content["processes"].values()):
         click.echo(f"  {'process':<22} {'state':<10} last report")
         for name, told in content["processes"].items():
-            alive = bool(told) and told["age_s"] <= MAX_AGE_S
             age = f"{told['age_s']:.0f} s ago" if told else "never"
-            click.echo(f"  {name:<22} {'running' if alive else 'SILENT':<10} {age}")
+            click.echo(f"  {name:<22} {'running' if reports(told) else 'SILENT':<10} {age}")
     cameras = content["sync"].get("cameras", {})
     if cameras:
         click.echo(f"  {'camera':<22} {'state':<10} {'frames':>8} {'lost':>6} {'Hz':>5}")

@@ -22,6 +22,13 @@ def skew(vector: ArrayLike) -> Array:
     return matrix
 
 
+def level_axes(up: Array) -> Array:
+    """Two perpendicular unit vectors (2, 3) across a unit vector (3,), which is not along x."""
+    first = np.cross(up, (1.0, 0.0, 0.0))
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first)])
+
+
 def so3_exp(rotation_vector: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues)."""
     v = np.asarray(rotation_vector, dtype=np.float64)

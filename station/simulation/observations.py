@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.ball import find_ball
 from station.calibration.detect.detections import (
-    AROUND,
     BALL,
     EMPTY,
     FRONT,
     HANGING,
     MARK,
-    RAISED,
+    PLACES,
     BallDetection,
     Observations,
     PlaneObservation,
@@ -79,7 +78,7 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
     around = {
         step: balls(step, _HANGING_LOOK_S if step.startswith(HANGING) else _LOOK_S)
         for step in procedure.steps
-        if step.startswith((AROUND, *RAISED))
+        if step.startswith(PLACES)
     }
     return Observations(
         waved, mark, front, [plane for plane in planes if plane is not None], around

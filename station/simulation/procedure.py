@@ -17,7 +17,7 @@ from station.calibration.detect.detections import (
     FRONT,
     HANGING,
     MARK,
-    RAISED,
+    PLACES,
     STAND,
     raised_height_m,
 )
@@ -100,7 +100,7 @@ class VirtualProcedure:
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
         view = self._still(camera, self._board_y_m(step))
         # The background is a short loop with noise; only moving objects are drawn in each frame.
-        moves = step in (BALL, MARK, FRONT) or step.startswith((AROUND, *RAISED))
+        moves = step in (BALL, MARK, FRONT) or step.startswith(PLACES)
         still = NoiselessView.of(view, unit.error)
         loop = [still.read(rng) for _ in range(_STILL_FRAMES if moves else 0)]
         start_s = self.starts_s(step)
@@ -188,7 +188,7 @@ class VirtualProcedure:
         waved = step == BALL
         center = self.ball_center_m(time_s) if waved else self.resting_m(step, time_s)
         shapes = [ball(center, radius_m, self.axis(step, time_s), self.oval_share)]
-        if step == BALL:
+        if waved:
             shapes += self._path.person(
                 center, time_s, radius_m, covers=violations.HAND in switches
             )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from station.calibration.adjust.ball_shape import SHAPE, shape_terms
 from station.calibration.adjust.problem import BOW_SIZE, Indices, Layout, Problem, State
 from station.calibration.detect.detections import FLOOR, HANGING
+from station.core.geometry import level_axes
 
 Array = NDArray[np.float64]
 
@@ -31,10 +32,10 @@ PLUMB = "plumb"
 """Name of the plumb line among the places."""
 _TAIL = 4.0
 """Degrees of freedom (Student's t) of a contact: the ball may lie on something else."""
-_STAND_TAIL = 20.0
-"""Degrees of freedom of a measured height, which is hardly wrong: sensors whose errors have an
-unexpected form must not push it aside."""
-_FLOOR_WRONG, _STAND_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.02
+_SURE_TAIL = 20.0
+"""Degrees of freedom of a measured height and a plumb line, which are hardly wrong: sensors whose
+errors have an unexpected form must not push them aside."""
+_FLOOR_WRONG, _HEIGHT_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.02
 """Odds against all being as was said, of something that lies under the ball at one place, of one
 height that was measured wrongly, of all heights being wrong by the same amount (measured with a
 tape whose hook is loose, or from a carpet), and of a hook that moved between two heights."""
@@ -77,12 +78,12 @@ class Contacts:
         raised = np.array([place in problem.heights_m for place in places])
         sigma_m = np.where(raised, np.hypot(CONTACT_M, TAPE_M), CONTACT_M)
         # A ball that lies on something else must not tilt the floor before that is found out.
-        tail = np.where(raised, _STAND_TAIL, _TAIL)
+        tail = np.where(raised, _SURE_TAIL, _TAIL)
         if (ends := plumb_ends(problem)) is not None:
             plumb_rows, plumb_off_m = _plumb(layout, state, *ends)
             places += (PLUMB, PLUMB)
             rows, off_m = np.concatenate([rows, plumb_rows]), np.append(off_m, plumb_off_m)
-            sigma_m, tail = np.append(sigma_m, [PLUMB_M] * 2), np.append(tail, [_STAND_TAIL] * 2)
+            sigma_m, tail = np.append(sigma_m, [PLUMB_M] * 2), np.append(tail, [_SURE_TAIL] * 2)
         weight = sigma_m**-2.0 * tail / (tail + (off_m / sigma_m) ** 2)
         return cls(places, rows, off_m, sigma_m, weight)
 
@@ -105,7 +106,7 @@ def beliefs(problem: Problem) -> Sequence[Belief]:
     """All that may be wrong, one thing at a time, after the belief that nothing is."""
     raised = tuple(problem.heights_m)
     odds: dict[tuple[str, ...], tuple[float, float]] = {
-        (place,): (_STAND_WRONG if place in raised else _FLOOR_WRONG, _ONE_WRONG_M)
+        (place,): (_HEIGHT_WRONG if place in raised else _FLOOR_WRONG, _ONE_WRONG_M)
         for place in problem.resting
     }
     if len(raised) > 1:
@@ -119,8 +120,8 @@ def beliefs(problem: Problem) -> Sequence[Belief]:
 
 def plumb_ends(problem: Problem) -> tuple[str, str] | None:
     """The lowest and the highest place at which the ball hung; None unless there are two."""
-    hung = [place for place in problem.heights_m if place.startswith(HANGING)]
-    hung.sort(key=lambda place: problem.heights_m[place])
+    heights_m = problem.heights_m
+    hung = sorted((at for at in heights_m if at.startswith(HANGING)), key=heights_m.__getitem__)
     return (hung[0], hung[-1]) if len(hung) > 1 else None
 
 
@@ -163,9 +164,7 @@ def _plumb(layout: Layout, state: State, low: str, high: str) -> tuple[Array, Ar
     q = state.planes[FLOOR]
     length = np.linalg.norm(q)
     up = -q / length
-    first = np.cross(up, (1.0, 0.0, 0.0))
-    first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(up, first)])
+    axes = level_axes(up)
     between = state.places[high] - state.places[low]
     rows = np.zeros((2, layout.size))
     rows[:, layout.triple(high)], rows[:, layout.triple(low)] = axes, -axes

@@ -17,6 +17,7 @@ from station.calibration.adjust.ball_shape import SHAPE, shape_terms
 from station.calibration.adjust.problem import Sightings, Surface
 from station.calibration.adjust.sensor_model import SensorModel
 from station.calibration.detect.ball_image import ball_inverse_depth
+from station.core.geometry import level_axes
 from station.core.lens import pixel_rays
 from station.core.rig import CameraCalibration
 
@@ -332,8 +333,7 @@ def bow_terms(points: Array, mark: Array, up: Array) -> Array:
     The plane takes up the linear ones: with them, it is the level of the whole floor and not that
     of the floor at the mark, and its slope is known no better than a bowed floor leans there.
     """
-    first = np.cross(up, (1.0, 0.0, 0.0))
-    first /= np.linalg.norm(first)
+    first, second = level_axes(up)
     away = points - mark
-    x, y = away @ first, away @ np.cross(up, first)
+    x, y = away @ first, away @ second
     return np.stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3], axis=-1)

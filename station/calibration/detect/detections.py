@@ -29,6 +29,8 @@ EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND, HANGING = (
 "stand-1700" and "hanging-1800" by the height in millimetres."""
 RAISED = (STAND, HANGING)
 """Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
+PLACES = (AROUND, *RAISED)
+"""Steps of the resting ball that may be repeated elsewhere."""
 FLOOR = "floor"
 _FEWEST_PATCHES = 3
 """Fewer do not make a plane."""

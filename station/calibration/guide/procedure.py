@@ -15,6 +15,7 @@ from station.calibration.detect.detections import (
     FRONT,
     HANGING,
     MARK,
+    PLACES,
     RAISED,
     STAND,
     WALL,
@@ -34,7 +35,7 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
 
-_STEPS = (EMPTY, BALL, MARK, FRONT, WALL, AROUND, *RAISED)
+_STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
 _SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
 _SURE_OF_RADIUS = 60

@@ -23,6 +23,7 @@ from station.calibration.detect.detections import (
     EMPTY,
     FRONT,
     MARK,
+    PLACES,
     RAISED,
     WALL,
     BallDetection,
@@ -290,7 +291,7 @@ class Session:
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
-        elif step.startswith((AROUND, *RAISED)):
+        elif step.startswith(PLACES):
             for other in [name for name in self.around if _same_height(name, step)]:
                 del self.around[other]
             self.around[step] = self._balls(entry)
