@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import struct
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -12,10 +11,10 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.depth_image import image_of_png, png_of, png_size
 from station.core.errors import BundleError, CalibrationError
 from station.core.files import private_folder, read_json, read_regular, write_json
 from station.core.rig import Rig
@@ -24,11 +23,6 @@ FORMAT = "booth-bundle"
 VERSIONS = frozenset({1})
 MANIFEST = "bundle.json"
 CALIBRATION = "calibration.json"
-_PNG_FAST = [
-    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
-]  # fmt: skip
-"""A sensor has few distinct depths: whole readings repeat, differences of neighbours do not. So
-files are smaller unfiltered, and quicker to write and to read."""
 _ENCODERS = 2
 _PNG_SLACK_BYTES = 1 << 16
 """Allowance beyond twice the pixels' own size, which not even a PNG of noise reaches."""
@@ -92,12 +86,12 @@ class Bundle:
         except ValueError as cause:
             raise BundleError(f"{path} {cause}; scan again") from None
         # Checked before decoding: a small file may claim to be an image of gigabytes.
-        found = _png_size(data)
+        found = png_size(data)
         if found is None:
             raise BundleError(f"{path} is torn or not a PNG; scan again")
         if found != expected:
             raise BundleError(f"{path} is {found}; camera {camera} needs uint16 {expected}")
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = image_of_png(data)
         if image is None:
             raise BundleError(f"{path} is torn or not a PNG; scan again")
         if image.dtype != np.uint16 or image.shape != expected:
@@ -109,19 +103,6 @@ class Bundle:
     def depth_stack(self, camera: str) -> NDArray[np.uint16]:
         """All depth images of a camera, (frames, height, width)."""
         return np.stack([self.read_frame(camera, record) for record in self.frames[camera]])
-
-
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Height and width from a PNG's first chunk; None if it is torn or not a PNG.
-
-    OpenCV silently decodes a torn PNG to black rows, so its last chunk is checked, too.
-    """
-    if not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
-        return None
-    if data[-8:-4] != b"IEND":
-        return None
-    width, height = struct.unpack(">II", data[16:24])
-    return height, width
 
 
 def read_bundle(folder: Path) -> Bundle:
@@ -273,10 +254,11 @@ def _write_frames(folder: Path, camera: str, taken: Sequence[CapturedFrame]) -> 
     def write(index: int) -> dict[str, Any]:
         frame = taken[index]
         file = f"depth/{camera}/{index:03d}.png"
-        done, encoded = cv2.imencode(".png", frame.depth, _PNG_FAST)
-        if not done:
-            raise BundleError(f"{folder / file}: the frame cannot be written as a PNG")
-        (folder / file).write_bytes(encoded.tobytes())
+        try:
+            content = png_of(frame.depth)
+        except ValueError as cause:
+            raise BundleError(f"{folder / file}: the frame {cause}") from None
+        (folder / file).write_bytes(content)
         record = FrameRecord(
             file, frame.device_ticks, frame.tick_hz, frame.host_time_s, frame.sequence
         )

@@ -1,0 +1,94 @@
+"""16-bit PNG files as other programs write them, and torn ones."""
+
+import struct
+import zlib
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from station.core.depth_image import image_of_png, png_of, png_size
+
+Writer = Callable[[NDArray[np.uint16]], bytes]
+RNG = np.random.default_rng(0)
+DEPTH = (2000 + np.add.outer(np.arange(48), 3 * np.arange(64))).astype(np.uint16)
+DEPTH[RNG.random(DEPTH.shape) < 0.2] = 0
+WRITERS: dict[str, Writer] = {
+    "booth": png_of,
+    "OpenCV": lambda image: cv2.imencode(".png", image)[1].tobytes(),
+    "changing filters": lambda image: cv2.imencode(
+        ".png",
+        image,
+        [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_ALL_FILTERS],
+    )[1].tobytes(),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("size", [(48, 64), (1, 1), (7, 3)])
+def test_whoever_wrote_it(writer: str, size: tuple[int, int]) -> None:
+    image = np.ascontiguousarray(DEPTH[: size[0], : size[1]])
+    content = WRITERS[writer](image)
+    assert png_size(content) == size
+    found = image_of_png(content)
+    assert found is not None
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, image)
+
+
+def test_the_writers_differ() -> None:
+    """Unfiltered rows, differences from the pixel before, and a filter for each row."""
+    kinds = [
+        set(zlib.decompress(_rows(writer(DEPTH)))[:: 1 + 2 * 64]) for writer in WRITERS.values()
+    ]
+    assert kinds[:2] == [{0}, {1}]
+    assert len(kinds[2]) > 1
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_no_changed_byte_goes_unnoticed(writer: str) -> None:
+    content = WRITERS[writer](DEPTH)
+    for at in range(33, len(content) - 12, 37):
+        torn = bytearray(content)
+        torn[at] ^= 0x10
+        assert image_of_png(bytes(torn)) is None
+
+
+@pytest.mark.parametrize("rows", [0, 20, 47, 49])
+def test_an_image_has_all_of_its_rows_and_no_more(rows: int) -> None:
+    """A sound file whose rows are fewer than its header says would be black below."""
+    plain = np.zeros((rows, 1 + 2 * 64), np.uint8).tobytes()
+    assert image_of_png(_file(64, 48, zlib.compress(plain))) is None
+
+
+@pytest.mark.parametrize("packed", [b"", b"no zlib", zlib.compress(bytes(48 * 129))[:-8]])
+def test_what_cannot_be_inflated_is_torn(packed: bytes) -> None:
+    assert image_of_png(_file(64, 48, packed)) is None
+
+
+def test_eight_bits_are_left_to_who_asks() -> None:
+    """A bundle refuses them; it says what it found."""
+    found = image_of_png(cv2.imencode(".png", DEPTH.astype(np.uint8))[1].tobytes())
+    assert found is not None
+    assert found.dtype == np.uint8
+
+
+def _file(width: int, height: int, packed: bytes) -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def _rows(content: bytes) -> bytes:
+    at, packed = 8, b""
+    while at < len(content):
+        (length,) = struct.unpack(">I", content[at : at + 4])
+        if content[at + 4 : at + 8] == b"IDAT":
+            packed += content[at + 8 : at + 8 + length]
+        at += 12 + length
+    return packed
