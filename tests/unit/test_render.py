@@ -66,14 +66,15 @@ def test_triangles_take_their_colours() -> None:
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
-    """Whatever the order of the triangles and whichever way they turn."""
+    """Whatever the order of the triangles; those that turn away are not seen."""
     square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 0, 2], [-1, 0, 2]])
     vertices = np.concatenate([square, 0.5 * square + (0.0, -0.3, 0.5)])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], np.int32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     frame = Frame("front", 50, 50, 0.05, (0.0, 0.0, 1.0))
-    for order in ([0, 1, 2, 3], [3, 2, 1, 0]):
-        shown = Scene(vertices, faces[order]).render(frame)
-        assert shown.depth_m[25, 25] == pytest.approx(frame.depths(vertices[4:5])[0])
+    away = np.concatenate([faces[:2], faces[2:, ::-1]])
+    for drawn, nearest in ((faces, 4), (faces[::-1], 4), (away, 0)):
+        shown = Scene(vertices, drawn).render(frame)
+        assert shown.depth_m[25, 25] == pytest.approx(frame.depths(vertices)[nearest])
         assert shown.depth_m[10, 10] == pytest.approx(frame.depths(vertices[:1])[0])
         assert np.isinf(shown.depth_m[2, 2])
 

@@ -19,7 +19,8 @@ def nearest_triangles(u, v, depth, shade, faces, height, width):  # type: ignore
 
     Args:
         u, v: (P,) where vertices lie in the picture; a pixel's middle is at whole numbers.
-        depth, shade: (P,), linear over each triangle (K, 3).
+        depth, shade: (P,), linear over each triangle.
+        faces: (K, 3), counter-clockwise seen from outside; those seen from behind are left out.
     """
     rows, columns = FINER * height, FINER * width
     nearest = np.full((rows, columns), np.float32(np.inf))
@@ -32,7 +33,7 @@ def nearest_triangles(u, v, depth, shade, faces, height, width):  # type: ignore
         ub, vb = FINER * u[b] + shift, FINER * v[b] + shift
         uc, vc = FINER * u[c] + shift, FINER * v[c] + shift
         area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if area == 0.0:
+        if area >= 0.0:  # seen from behind, or from the side
             continue
         # The weights of the second and third corner, linear in column and row.
         across2, down2 = (vc - va) / area, (ua - uc) / area

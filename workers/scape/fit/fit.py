@@ -46,6 +46,7 @@ from workers.scape.fit.verdict import (
 )
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.halves import started
 from workers.scape.surface.displacement import SurfaceFit, fit_surface
 from workers.scape.surface.intersections import untangled
 
@@ -199,17 +200,14 @@ def fit_overlapping(
     crown_sigma = crown_sigma_m(
         model, scan.views, poses, surface.vertices, cloud.points, surface.seen
     )
-    # Only intervals and verdict need these, so that whoever separates limbs does not wait for them.
-    beside = ThreadPoolExecutor(1)
-    patches = beside.submit(unmatched_patches, model, surface.vertices, cloud)
-    beside.shutdown(wait=False)
     return OverlappingFit(
         state=state,
         vertices=_rounded(surface.vertices),
         surface=surface,
         reference=reference,
         crown_sigma_m=crown_sigma,
-        patches=patches,
+        # Only intervals and verdict need these: whoever separates limbs does not wait for them.
+        patches=started(unmatched_patches, model, surface.vertices, cloud),
         cloud=cloud,
         correspondences=used,
         iterations=iterations,
@@ -230,7 +228,8 @@ def separate_limbs(
     start = time.monotonic()
     surface, vertices = fit.surface, fit.surface.vertices
     if fit.reference is not None:
-        vertices = untangled(model, vertices, fit.reference, surface.measured)
+        crossing = None if surface.crossing is None else surface.crossing.result()
+        vertices = untangled(model, vertices, fit.reference, surface.measured, crossing)
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
@@ -285,21 +284,23 @@ def _best_start(
     Of starts that leave points unexplained, the best has the least sum of their share and the share
     of skin that cameras saw through: a body with its arms up explains one whose arm was not seen.
     """
-    best, least, first = None, np.inf, starts[0]
+    best, hidden, least, first = None, None, np.inf, starts[0]
     cameras = CameraCorrections.build(cloud, views)
     for start in starts[:_MAX_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
+        looked = started(is_head_hidden, model, coarse.vertices, cloud.points)
         left = unexplained_share(model, coarse.vertices, cloud)
         if left < _EXPLAINED:
-            best, first = coarse, start
+            best, hidden, first = coarse, looked, start
             break
         poses = coarse.cameras.poses(views)
         absent = target.free_space.seen_through(poses, coarse.vertices)
         wrong = left + float(absent @ model.vertex_shares) / len(absent)
         if wrong < least:
-            best, least, first = coarse, wrong, start
+            best, hidden, least, first = coarse, looked, wrong, start
     assert best is not None
-    if is_head_hidden(model, best.vertices, cloud.points):
+    assert hidden is not None
+    if hidden.result():
         start = taller(model, first)
         best = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
     done, total = 0, len(MIDDLE) + len(FINE)

@@ -17,11 +17,10 @@ from scipy.sparse.csgraph import connected_components
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
-from workers.scape.surface.crossings import crossing_pairs
+from workers.scape.surface.crossings import Pairs, crossing_pairs
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Pairs = NDArray[np.int32]
 
 _ARM = ("upper_arm", "forearm", *HAND)
 _ROUNDS = 12

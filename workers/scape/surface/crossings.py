@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from workers.scape.model.deformation import Faces
 
 Array = NDArray[np.float64]
+Pairs = NDArray[np.int32]
 
 _CELL_M = 0.02
 """Cell size of the grid that finds triangles near those that are tested."""
 
 
-def crossing_pairs(
-    vertices: Array, faces: Faces, tested: NDArray[np.bool_] | None = None
-) -> NDArray[np.int32]:
+def crossing_pairs(vertices: Array, faces: Faces, tested: NDArray[np.bool_] | None = None) -> Pairs:
     """Pairs (m, 2) of triangles that cross.
 
     Triangles that share a vertex count if they cross elsewhere; triangles that share an edge cannot

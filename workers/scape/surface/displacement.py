@@ -15,7 +15,7 @@ did. Rounds narrow the gate and weaken the prior.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,8 +29,10 @@ from workers.scape.evidence.floor import stand_on_floor
 from workers.scape.evidence.rows import Rows
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.halves import started
 from workers.scape.surface.attachment import Attachments, attached
 from workers.scape.surface.contours import contour_places, contour_rows, side_offsets_px
+from workers.scape.surface.crossings import Pairs, crossing_pairs
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import offset_prior
 from workers.scape.surface.uncertainty import surface_sigma
@@ -101,6 +103,8 @@ class SurfaceFit:
     """(P,): vertices of triangles with points on them."""
     mismatch_m: float
     """Rms distance of the points from the model's surface before it was displaced."""
+    crossing: Future[Pairs] | None = None
+    """Pairs (m, 2) of triangles that cross, which are searched for meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +243,9 @@ def fit_surface(
             joined = OffsetRows.joined(*rows)
             offset = solved(model, prior, of_round_m, joined, offset, round_.enough)
     assert before is not None
-    return _examined(model, stand_on_floor(model, vertices + offset), readings, before)
+    fitted = stand_on_floor(model, vertices + offset)
+    crossing = started(crossing_pairs, fitted, model.faces)
+    return _examined(model, fitted, readings, before, crossing)
 
 
 def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Array:
@@ -270,7 +276,11 @@ def _of_ends(model: BodyModel) -> NDArray[np.bool_]:
 
 
 def _examined(
-    model: BodyModel, vertices: Array, readings: _Readings, before: _AtVertices
+    model: BodyModel,
+    vertices: Array,
+    readings: _Readings,
+    before: _AtVertices,
+    crossing: Future[Pairs],
 ) -> SurfaceFit:
     """A fitted surface (P, 3) with what is known of it.
 
@@ -292,6 +302,7 @@ def _examined(
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,
         mismatch_m=before.rms_m,
+        crossing=crossing,
     )
 
 

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, area_vectors, vertex_normals
-from workers.scape.surface.contacts import Pairs, grown, neighbour_mean, parted
-from workers.scape.surface.crossings import crossing_pairs
+from workers.scape.surface.contacts import grown, neighbour_mean, parted
+from workers.scape.surface.crossings import Pairs, crossing_pairs
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -62,7 +62,13 @@ def turned_over(vertices: Array, reference: Array, faces: Faces) -> Mask:
     return np.asarray(turned)
 
 
-def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mask) -> Array:
+def untangled(
+    model: BodyModel,
+    vertices: Array,
+    reference: Array,
+    measured: Mask,
+    crossing: Pairs | None = None,
+) -> Array:
     """Surface (P, 3) without crossings and flipped triangles.
 
     Parts that are centimetres inside each other, as on no real body, stay as they are: flattening
@@ -73,10 +79,12 @@ def untangled(model: BodyModel, vertices: Array, reference: Array, measured: Mas
         reference: (P, 3), the model's surface in the same pose and shape.
         measured: (P,), vertices of triangles with readings on them. They are moved only where
             crossings remain otherwise.
+        crossing: (m, 2), pairs of the fitted surface's triangles that cross, if they are known.
     """
     faces = model.faces
     mean = neighbour_mean(model)
-    crossing = crossing_pairs(vertices, faces)
+    if crossing is None:
+        crossing = crossing_pairs(vertices, faces)
     current = first = parted(model, vertices, measured, crossing)
     if current is not vertices:
         crossing = crossing_pairs(current, faces)
