@@ -338,8 +338,9 @@ def test_a_row_says_whether_cameras_saw_its_line(model: BodyModel) -> None:
     """The front alone: what runs along the front is seen, the back's is the model's."""
     seen = model.mean[:, 1] < model.mean[model.landmarks["waist_side_left"], 1]
     skin = SeenSkin.build(model, model.mean, seen)
-    basis = {trace.definition.name: skin.basis(trace)
-             for trace in trace_all(model, model.mean)}  # fmt: skip
+    traces = trace_all(model, model.mean)
+    names = [trace.definition.name for trace in traces]
+    basis = dict(zip(names, skin.bases(traces), strict=True))
     assert basis["across_front_skin_width"] == basis["crotch_length_front"] == "seen"
     assert basis["waist_girth"] == basis["belly_girth"] == "partly"
     assert basis["crotch_length_back"] == basis["across_back_skin_width"] == "inferred"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,15 +52,58 @@ def obj_mesh(vertices: Array, model: BodyModel, comments: Sequence[str] = ()) ->
     lines = [
         "# metres, z up\n",
         *(f"# {line}\n" for line in comments),
-        ("v %.6f %.6f %.6f\n" * len(vertices)) % tuple(vertices.ravel()),
-        ("vn %.4f %.4f %.4f\n" * len(normals)) % tuple(normals.ravel()),
-        _obj_faces(model),
     ]
-    return "".join(lines).encode()
+    return b"".join(
+        [
+            "".join(lines).encode(),
+            _lines(b"v", vertices, 6),
+            _lines(b"vn", normals, 4),
+            _obj_faces(model),
+        ]
+    )
+
+
+def _lines(keyword: bytes, rows: Array, decimals: int) -> bytes:
+    """A line of text for each row (n, 3): a keyword and three numbers."""
+    letters = np.frombuffer(keyword, np.uint8)
+    return bytes(_written(letters, rows, 10**decimals, decimals))
+
+
+@numba.njit(cache=True, nogil=True)
+def _written(keyword, rows, scale, decimals):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Text of rows (n, 3), which Python's own formatting takes six times as long for."""
+    out = np.empty(len(rows) * (len(keyword) + 3 * (decimals + 22) + 1), np.uint8)
+    digits = np.empty(20, np.uint8)
+    at = 0
+    for row in rows:
+        for letter in keyword:
+            out[at] = letter
+            at += 1
+        for value in row:
+            out[at] = 32  # " "
+            at += 1
+            if value < 0.0:
+                out[at] = 45  # "-"
+                at += 1
+            left = np.int64(np.rint(abs(value) * scale))
+            count = 0
+            while left > 0 or count <= decimals:
+                digits[count] = 48 + left % 10  # "0"
+                left //= 10
+                count += 1
+            for place in range(count - 1, -1, -1):
+                out[at] = digits[place]
+                at += 1
+                if place == decimals:
+                    out[at] = 46  # "."
+                    at += 1
+        out[at] = 10  # end of the line
+        at += 1
+    return out[:at]
 
 
 @lru_cache(maxsize=2)
-def _obj_faces(model: BodyModel) -> str:
+def _obj_faces(model: BodyModel) -> bytes:
     """Lines of the faces, which are the same for every body."""
     corners = np.repeat(model.faces.ravel() + 1, 2)
-    return ("f %d//%d %d//%d %d//%d\n" * len(model.faces)) % tuple(corners)
+    return (("f %d//%d %d//%d %d//%d\n" * len(model.faces)) % tuple(corners)).encode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,13 +125,14 @@ def _measured(
             interval,
             trace.path(shown),
             trace.closed,
-            _basis(skin, trace, scan_errors),
+            basis,
             _parts_of(model, trace),
         )
-        for trace, value, interval in zip(
+        for trace, value, interval, basis in zip(
             traces,
             values,
             intervals(traces, values, vertex_sigma_m, pose, scan_errors),
+            _bases(skin, traces, scan_errors),
             strict=True,
         )
     )
@@ -147,15 +149,19 @@ def _measured(
     )
 
 
-def _basis(skin: SeenSkin | None, trace: Trace, scan_errors: ScanErrors) -> Basis:
-    """The basis of a row. The top of a head counts as seen where the cameras saw the head end, for
-    it gives no readings itself.
+def _bases(skin: SeenSkin | None, traces: Sequence[Trace], scan_errors: ScanErrors) -> list[Basis]:
+    """The bases of all rows. The top of a head counts as seen where the cameras saw the head end,
+    for it gives no readings itself.
     """
     if skin is None:
-        return "seen"
-    if isinstance(trace.definition.kind, Top):
-        return "inferred" if scan_errors.crown_sigma_m > 0.0 else "seen"
-    return skin.basis(trace)
+        return ["seen"] * len(traces)
+    top: Basis = "inferred" if scan_errors.crown_sigma_m > 0.0 else "seen"
+    of_others = iter(skin.bases([row for row in traces if not _is_top(row)]))
+    return [top if _is_top(row) else next(of_others) for row in traces]
+
+
+def _is_top(trace: Trace) -> bool:
+    return isinstance(trace.definition.kind, Top)
 
 
 def _parts_of(model: BodyModel, trace: Trace) -> frozenset[str]:

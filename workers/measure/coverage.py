@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -45,27 +47,54 @@ class SeenSkin:
         share = (known + model.adjacency @ known) / (1.0 + degree)
         return cls(vertices, share, cKDTree(vertices, balanced_tree=False))
 
-    def seen_along(self, trace: Trace) -> float:
-        """Share of a row's line that cameras saw, by length; of its ends where only these count.
+    def seen_along(self, traces: Sequence[Trace]) -> Array:
+        """Shares (n,) of rows' lines that cameras saw, by length; of their ends where only these
+        count.
 
         Where a tape spans a hollow, the nearest skin counts.
         """
+        lines = [self._looked_up(trace) for trace in traces]
+        nearest = self.tree.query(np.concatenate(lines))[1]
+        counts = np.array([len(line) for line in lines])
+        return np.add.reduceat(self.share[nearest], np.cumsum(counts) - counts) / counts
+
+    def _looked_up(self, trace: Trace) -> Array:
+        """Places (n, 3) at which the skin of a row is looked up."""
         places = trace.points.on(self.vertices)
-        if trace.definition.quantity not in _BETWEEN_ENDS:
-            places = _resampled(places, closed=trace.closed)
-        return float(self.share[self.tree.query(places)[1]].mean())
+        if trace.definition.quantity in _BETWEEN_ENDS:
+            return places
+        return np.asarray(_evenly(places, trace.closed, _STEP_M))
 
-    def basis(self, trace: Trace) -> Basis:
-        """The basis of a row."""
-        share = self.seen_along(trace)
-        if share >= SEEN_SHARE:
-            return "seen"
-        return "partly" if share >= INFERRED_SHARE else "inferred"
+    def bases(self, traces: Sequence[Trace]) -> list[Basis]:
+        """The bases of some rows."""
+        if not traces:
+            return []
+        return [
+            "seen" if share >= SEEN_SHARE else "partly" if share >= INFERRED_SHARE else "inferred"
+            for share in self.seen_along(traces)
+        ]
 
 
-def _resampled(places: Array, *, closed: bool) -> Array:
-    """Evenly spaced points of a polyline (n, 3)."""
-    line = np.concatenate([places, places[:1]]) if closed else places
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    wanted = np.linspace(0.0, along[-1], 1 + max(1, round(along[-1] / _STEP_M)))
-    return np.stack([np.interp(wanted, along, line[:, i]) for i in range(3)], axis=1)
+@numba.njit(cache=True, nogil=True)
+def _evenly(places, closed, step_m):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Evenly spaced points of a polyline (n, 3), about a step apart, ends included."""
+    count = len(places)
+    along = np.zeros(count + 1)
+    for index in range(count):
+        square = 0.0
+        for i in range(3):
+            square += (places[(index + 1) % count, i] - places[index, i]) ** 2
+        along[index + 1] = along[index] + np.sqrt(square)
+    length = along[count] if closed else along[count - 1]
+    steps = max(1, int(np.rint(length / step_m)))
+    out = np.empty((steps + 1, 3))
+    at = 0
+    for index in range(steps + 1):
+        wanted = length * index / steps
+        while at < count - 1 and along[at + 1] < wanted:
+            at += 1
+        share = (wanted - along[at]) / max(along[at + 1] - along[at], 1e-12)
+        for i in range(3):
+            start, end = places[at, i], places[(at + 1) % count, i]
+            out[index, i] = start + min(share, 1.0) * (end - start)
+    return out

@@ -73,12 +73,8 @@ class EdgeNet:
 
     def cut(self, vertices: Array, point: Array, normal: Array) -> tuple[EdgePoints, Index]:
         """Points at which a plane cuts the edges, and the edge of each."""
-        away = vertices @ normal - point @ normal
-        from_m, to_m = away[self.tails], away[self.heads]
-        crossing = np.flatnonzero((from_m < 0.0) != (to_m < 0.0))
-        from_m, to_m = from_m[crossing], to_m[crossing]
-        found = EdgePoints(self.tails[crossing], self.heads[crossing], from_m / (from_m - to_m))
-        return found, crossing
+        crossing, share = _crossing(vertices, self.tails, self.heads, point, normal)
+        return EdgePoints(self.tails[crossing], self.heads[crossing], share), crossing
 
     def pieces(self, crossing: Index) -> Index:
         """The connected piece of a section that each cut edge belongs to."""
@@ -86,15 +82,50 @@ class EdgeNet:
 
     def segments(self, crossing: Index) -> tuple[Index, Index]:
         """Pairs of cut edges, by their place in `crossing`, that one triangle joins."""
-        triangle = np.concatenate([self.left[crossing], self.right[crossing]])
-        cut_edge = np.tile(np.arange(len(crossing)), 2)
-        order = np.argsort(triangle, kind="stable")
-        triangle, cut_edge = triangle[order], cut_edge[order]
-        same = np.flatnonzero(triangle[1:] == triangle[:-1])
-        return cut_edge[same], cut_edge[same + 1]
+        one, other = _joined(self.left[crossing], self.right[crossing])
+        return one, other
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
+def _crossing(vertices, tails, heads, point, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Edges that a plane cuts, and the share of each at which it does."""
+    away = np.empty(len(vertices))
+    for v in range(len(vertices)):
+        away[v] = 0.0
+        for i in range(3):
+            away[v] += (vertices[v, i] - point[i]) * normal[i]
+    edges, shares = np.empty(len(tails), np.int64), np.empty(len(tails))
+    count = 0
+    for edge in range(len(tails)):
+        start, end = away[tails[edge]], away[heads[edge]]
+        if (start < 0.0) != (end < 0.0):
+            edges[count], shares[count] = edge, start / (start - end)
+            count += 1
+    return edges[:count].copy(), shares[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _joined(left, right):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Pairs of places (n,) that have a triangle in common; no more than two have the same one."""
+    count = len(left)
+    last = 0
+    for place in range(count):
+        last = max(last, left[place], right[place])
+    first = np.full(last + 1, -1, np.int64)
+    one, other = np.empty((2, 2 * count), np.int64)
+    size = 0
+    for place in range(count):
+        for side in range(1 if left[place] == right[place] else 2):
+            triangle = left[place] if side == 0 else right[place]
+            if first[triangle] < 0:
+                first[triangle] = place
+            else:
+                one[size], other[size] = first[triangle], place
+                size += 1
+    return one[:size].copy(), other[:size].copy()
+
+
+@numba.njit(cache=True, nogil=True)
 def _connected(tails, heads, count):  # type: ignore[no-untyped-def]  # pragma: no cover
     """The smallest of count places that each is linked to (union-find, paths halved)."""
     root = np.arange(count)
@@ -148,7 +179,7 @@ def encloses(hull: Array, normal: Array, point: Array) -> bool:
     return bool((turns >= 0.0).all() or (turns <= 0.0).all())
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _chain(u, v, order):  # type: ignore[no-untyped-def]  # pragma: no cover
     """The convex hull of points (n,), sorted by u and then v, counter-clockwise: the chain below
     and back the chain above (Andrew 1979, Information Processing Letters 9:216)."""
@@ -174,10 +205,35 @@ def _turn(u, v, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     return (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
 
 
+@numba.njit(cache=True, nogil=True)
+def around(places, values, chosen, center, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Weighted sum (3,) of chosen ones (k,) of the values (K, 3) at places (K, 3): the weight falls
+    with the square of the distance from a center, to 0 at the reach."""
+    total = np.zeros(3)
+    for k in chosen:
+        square = 0.0
+        for i in range(3):
+            square += ((places[k, i] - center[i]) / reach) ** 2
+        if square < 1.0:
+            for i in range(3):
+                total[i] += (1.0 - square) * values[k, i]
+    return total
+
+
 def loop_length(points: Array, *, closed: bool) -> float:
     """Length of a polyline (n, 3)."""
-    steps = np.diff(points, axis=0, append=points[:1]) if closed else np.diff(points, axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
+    return float(_length(points, closed))
+
+
+@numba.njit(cache=True, nogil=True)
+def _length(points, closed):  # type: ignore[no-untyped-def]  # pragma: no cover
+    count, length = len(points), 0.0
+    for start in range(count if closed else count - 1):
+        square = 0.0
+        for i in range(3):
+            square += (points[(start + 1) % count, i] - points[start, i]) ** 2
+        length += np.sqrt(square)
+    return length
 
 
 _BELOW_CHORD = 0.10
@@ -218,16 +274,32 @@ def surface_order(
     if taut:
         u, v = np.r_[0.0, x[order], length], np.r_[0.0, y[order], 0.0]
         return np.asarray(order[_taut(u, v)[1:-1] - 1], np.intp)
-    a, b = (index[near[segments[0]] & near[segments[1]]] for index in segments)
-    a, b = np.where(x[a] <= x[b], a, b), np.where(x[a] <= x[b], b, a)
-    here = x[order][:, None]
-    share = (here - x[a]) / np.maximum(x[b] - x[a], 1e-12)
-    height = np.where((here > x[a]) & (here < x[b]), y[a] + share * (y[b] - y[a]), -np.inf)
-    highest = height.max(axis=1, initial=-np.inf)
-    return np.asarray(order[y[order] >= highest - _OUTSIDE * length], np.intp)
+    return np.asarray(_outside(x, y, near, order, *segments, _OUTSIDE * length), np.intp)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
+def _outside(x, y, near, order, ones, others, slack):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Those of the points in an order that no segment between near points runs above."""
+    kept = np.empty(len(order), np.int64)
+    size = 0
+    for here in order:
+        highest = -np.inf
+        for segment in range(len(ones)):
+            a, b = ones[segment], others[segment]
+            if not (near[a] and near[b]):
+                continue
+            if x[a] > x[b]:
+                a, b = b, a
+            if x[a] < x[here] < x[b]:
+                share = (x[here] - x[a]) / max(x[b] - x[a], 1e-12)
+                highest = max(highest, y[a] + share * (y[b] - y[a]))
+        if y[here] >= highest - slack:
+            kept[size] = here
+            size += 1
+    return kept[:size]
+
+
+@numba.njit(cache=True, nogil=True)
 def _taut(u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Indices of the points (n,), sorted by u, that a tape above them touches, ends included."""
     kept = np.empty(len(u), np.int64)

@@ -35,6 +35,7 @@ from workers.measure.sections import (
     EdgeNet,
     EdgePoints,
     Index,
+    around,
     cross,
     encloses,
     hull_order,
@@ -127,7 +128,6 @@ class _Tracer:
         corners = vertices[model.faces]
         self._middles = corners.mean(axis=1)
         self._area_vectors = area_vectors(vertices, model.faces)
-        self._patches: dict[tuple[str, ...], tuple[Array, Array]] = {}
         self._cuts: dict[Section, _Tape] = {}
         self.missed: list[str] = []
         """Rows whose planes missed what they should cut, and why."""
@@ -322,16 +322,8 @@ class _Tracer:
 
     def _facing(self, route: Route, end: Array) -> Array:
         """Unit normal of the skin around an end of a leg."""
-        middles, areas = self._patch(route.parts)
         neck, crotch = (self._at(landmark) for landmark in TRUNK_ENDS)
-        away = (middles - end) / (NORMAL_RADIUS * np.linalg.norm(neck - crotch))
-        weight = np.maximum(0.0, 1.0 - np.einsum("ki,ki->k", away, away))
-        total = weight @ areas
+        reach_m = NORMAL_RADIUS * float(np.linalg.norm(neck - crotch))
+        triangles = _triangles(self._model, route.parts)
+        total = around(self._middles, self._area_vectors, triangles, end, reach_m)
         return np.asarray(total / np.linalg.norm(total))
-
-    def _patch(self, parts: tuple[str, ...]) -> tuple[Array, Array]:
-        """Middles and area vectors (k, 3) of the triangles of some parts; kept for other rows."""
-        if parts not in self._patches:
-            triangles = _triangles(self._model, parts)
-            self._patches[parts] = self._middles[triangles], self._area_vectors[triangles]
-        return self._patches[parts]

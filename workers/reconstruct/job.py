@@ -76,7 +76,7 @@ def warm_up() -> BodyModel:
     CameraCorrections(np.zeros((1, 3)), np.eye(6)[None], np.ones((1, 6))).corrected(cloud)
     joint_positions(model, model.mean, model.neutral_state().rotations)
     obj_mesh(model.mean, model)
-    measured = measure_body(model, model.mean)
+    measured = measure_body(model, model.mean, vertex_seen=fit.vertex_seen)
     preview(views_of(model.mean, model.faces), measured.rows, fit.verdict)
     gc.collect()
     gc.freeze()
