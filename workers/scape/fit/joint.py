@@ -111,7 +111,14 @@ def fit_jointly(
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
             state, cameras, evidence = _step(
-                model, state, cameras, derivative.result()[1], terms, prior, beside
+                model,
+                state,
+                cameras,
+                derivative.result()[1],
+                terms,
+                prior,
+                annealing.relaxation,
+                beside,
             )
             progress((step + 1) / len(schedule))
     assert terms is not None
@@ -132,6 +139,7 @@ def _step(
     derivative: Array32,
     terms: DataTerms,
     prior: TwistPrior,
+    relaxation: float,
     beside: ThreadPoolExecutor,
 ) -> tuple[BodyState, CameraCorrections, Callable[[], CameraEvidence] | None]:
     """One Gauss-Newton step, given the derivative (n, 3, D) of the samples; and a function that
@@ -164,7 +172,7 @@ def _step(
     delta = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), gradient)
     if coupling is not None:
         cameras = cameras.updated(delta[size:].reshape(-1, 6))
-    return updated(state, delta, shape), cameras, evidence
+    return updated(state, relaxation * delta, shape), cameras, evidence
 
 
 def _coupling(rows: Array32, terms: Future[CameraTerms]) -> tuple[CameraTerms, Array32]:
