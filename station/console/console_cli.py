@@ -9,7 +9,7 @@ import click
 
 from station.console.security.certificate import make_certificate
 from station.console.security.vault import SCOPES, Scope, Vault
-from station.core.commands import config_option
+from station.core.commands import Number, config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.service import return_freed_memory, set_up_logs, stop_event
 
@@ -75,9 +75,7 @@ def token() -> None:
     "--scope", "scopes", type=click.Choice(SCOPES), multiple=True, default=("read",),
     show_default=True, help="read: see scans; scan: take scans; manage: delete, calibrate",
 )  # fmt: skip
-@click.option(
-    "--days", type=click.FloatRange(min=0.0), help="the token expires after this many days"
-)
+@click.option("--days", type=Number(min=0.0), help="the token expires after this many days")
 @config_option
 def make(
     name: str, scopes: tuple[Scope, ...], days: float | None, config_path: Path | None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +29,18 @@ _OPTIONAL = {
 }
 """A library that may be missing -> the remedy."""
 _NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
+
+
+class Number(click.FloatRange):
+    """A number in a range. NaN lies in every range of click's own."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a number.", param, ctx)
+        return number
 
 
 class LazyGroup(click.Group):

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from station.calibration.detect.detections import EMPTY
+from station.core.commands import Number
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import STRIDE, VirtualProcedure
 from station.simulation.scene import fixed_posts, load_mesh
@@ -49,7 +50,7 @@ _PROCESSES = 2
 @click.option(
     "--calibration",
     "waving_s",
-    type=float,
+    type=Number(1.0, 600.0),
     help="also record a calibration, the ball waved for so many seconds; sensors then have depth "
     "errors of their own, and no calibration.json is written",
 )

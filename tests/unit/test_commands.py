@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from station import cli as station_cli
-from station.core.commands import LazyGroup, run
+from station.core.commands import LazyGroup, Number, run
 from workers import cli as workers_cli
 
 _ALL = [
@@ -26,6 +26,21 @@ def test_every_command_explains_itself(group: click.Group, name: str) -> None:
     result = CliRunner().invoke(group, [name, "--help"])
     assert result.exit_code == 0, result.output
     assert "Examples:" in result.output
+
+
+@pytest.mark.parametrize("given", ["nan", "inf", "-1", "two"])
+def test_a_number_is_finite_and_in_its_range(given: str) -> None:
+    """A token of nan days would never expire."""
+
+    @click.command()
+    @click.option("--days", type=Number(min=0.0))
+    def command(days: float) -> None:
+        click.echo(f"{days:.2f}")
+
+    refused = CliRunner().invoke(command, ["--days", given])
+    assert refused.exit_code == 2
+    assert given in refused.output
+    assert CliRunner().invoke(command, ["--days", "1.5"]).output == "1.50\n"
 
 
 @pytest.mark.parametrize("group", [station_cli.station, workers_cli.reconstruct])

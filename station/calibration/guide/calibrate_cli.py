@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from station.calibration.guide.operator import Guide
-from station.core.commands import config_option
+from station.core.commands import Number, config_option
 from station.core.config import find_config, load_config
 from station.core.errors import CalibrationError
 
@@ -208,7 +208,7 @@ def around(procedure: Procedure) -> None:
 @click.option(
     "--height",
     "height_m",
-    type=click.FloatRange(0.3, 2.2),
+    type=Number(0.3, 2.2),
     required=True,
     help="of the ball's underside above the floor, metres, measured to 1 mm",
 )

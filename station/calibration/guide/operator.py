@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import click
 
+from station.core.commands import Number
+
 _BELL = "\a"
 _LAST_SECONDS = 3
 _LINE_EVERY_S = 5.0
 _WIDTH = 100
-_HEIGHT = click.FloatRange(0.0, 2.2)
+_HEIGHT = Number(0.0, 2.2)
 """Metres: within sight of a booth's cameras."""
 
 
