@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from pathlib import Path
@@ -213,5 +214,12 @@ def capture(camera: str, config_path: Path | None) -> None:
     """
     config = load_config(find_config(config_path))
     config.camera(camera)
+    _discard_stdout()
     with only_process(config.runtime.folder, f"capture {camera}") as log:
         CaptureProcess(config, camera, log).run(stop_event())
+
+
+def _discard_stdout() -> None:
+    """Libraries of sensors print there: libfreenect's replay library at each recording's end."""
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 1)

@@ -21,6 +21,7 @@ from station.booth.supervisor import services
 from station.core.config import load_config
 from station.core.errors import BoothError, DriverError
 from station.core.files import held
+from station.core.service import read_health
 from station.core.spool import Spool
 from station.sensors.freenect import LIBRARY_VARIABLE, FreenectCamera, FreenectDriver
 from station.sensors.registry import make_driver
@@ -117,14 +118,39 @@ def test_a_missing_library_names_the_package(monkeypatch: pytest.MonkeyPatch, bo
         make_driver(camera).open()
 
 
-def test_a_recording_that_starts_over_loses_no_frames(booth: Path, tmp_path: Path) -> None:
-    """Its first frames may come before whoever reopened it goes on."""
-    recording = tmp_path / "short"
+def _short_recording(booth: Path, folder: Path) -> Path:
+    """Three frames of one camera."""
+    recording = folder / "short"
     recording.mkdir()
     names = (booth / "front-lower/INDEX.txt").read_text().splitlines()[:3]
     (recording / "INDEX.txt").write_text("\n".join(names) + "\n")
     for name in names:
         shutil.copy(booth / "front-lower" / name, recording)
+    return recording
+
+
+def test_a_recording_that_starts_over_says_nothing_each_time(
+    make_station: Callable[..., Station], booth: Path, tmp_path: Path
+) -> None:
+    """libfreenect's replay library prints a line at its end."""
+    short = _short_recording(booth, tmp_path)
+    station = make_station(
+        "[workers]\ncount = 0",
+        lambda text: text.replace(f"{booth}/front-lower", str(short)),
+    )
+    assert station.command("start").returncode == 0
+    runtime = load_config(station.config).runtime.folder
+    station.wait_until(
+        lambda: read_health(runtime, "capture front-lower").get("frames", 0) > 30,
+        "thirty frames of three",
+    )
+    station.close()
+    assert "No more lines" not in station.log.read_text()
+
+
+def test_a_recording_that_starts_over_loses_no_frames(booth: Path, tmp_path: Path) -> None:
+    """Its first frames may come before whoever reopened it goes on."""
+    recording = _short_recording(booth, tmp_path)
     driver = FreenectDriver(FreenectCamera(name="a", recording=recording))
     driver.open()
     try:
