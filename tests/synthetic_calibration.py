@@ -22,6 +22,7 @@ from station.calibration.detect.detections import (
     BALL,
     FLOOR,
     FRONT,
+    HANGING,
     MARK,
     RAISED,
     BallDetection,
@@ -29,6 +30,7 @@ from station.calibration.detect.detections import (
     PlaneObservation,
 )
 from station.calibration.detect.planes import mean_share
+from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import ROUNDING, SQUARE_ERROR
 from station.core.lens import pixel_rays, project
@@ -112,10 +114,11 @@ def observations(
         for step, found in resting.items():
             axis = procedure.axis(step, 0.0)
             looks = [
-                _ball(unit, procedure.resting_m(step, time_s), axis, procedure, rng)
-                for time_s in 0.2 * np.arange(15)
+                replace(seen, time_s=time_s)
+                for time_s in np.arange(0.0, LOOK_S, 0.2)
+                if (seen := _ball(unit, procedure.resting_m(step, time_s), axis, procedure, rng))
             ]
-            found += [detection for detection in looks if detection is not None]
+            found += whole_swings(looks) if step.startswith(HANGING) else looks
         planes.append(_floor(unit, procedure.booth, rng))
         for place, y in enumerate(procedure.board_at_m if boards else ()):
             planes.append(_board(unit, f"wall-{place}", y, rng))

@@ -21,6 +21,7 @@ from station.calibration.detect.detections import (
 )
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import static_view
+from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
 from station.sensors.clock import DeviceClock
@@ -31,8 +32,8 @@ _Depth = NDArray[np.uint16]
 
 _TRANSPORT_S = (0.004, 0.0015)
 """Least delay from exposure to host, and the mean of what comes on top."""
-_LOOK_S, _HANGING_LOOK_S = 1.0, 3.0
-"""At the ball on the floor, and at the board."""
+_LOOK_S = 1.0
+"""At the ball at rest, and at the board."""
 
 
 def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observations:
@@ -76,7 +77,9 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )
     around = {
-        step: balls(step, _HANGING_LOOK_S if step.startswith(HANGING) else _LOOK_S)
+        step: whole_swings(balls(step, LOOK_S))
+        if step.startswith(HANGING)
+        else balls(step, _LOOK_S)
         for step in procedure.steps
         if step.startswith(PLACES)
     }

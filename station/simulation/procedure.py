@@ -16,6 +16,7 @@ from station.calibration.detect.detections import (
     EMPTY,
     FRONT,
     HANGING,
+    HEIGHTS_M,
     MARK,
     PLACES,
     STAND,
@@ -38,7 +39,7 @@ Array = NDArray[np.float64]
 
 STRIDE = FRAME_RATE_HZ / INDEPENDENT_HZ
 """Every so many frames of a ball are used."""
-_REST_S, _HANG_S = 2.0, 4.0
+_REST_S, _HANG_S = 2.0, 5.0
 _PAUSE_S = 3.0
 """Between two steps, while the person walks away."""
 _STILL_FRAMES = 8
@@ -70,7 +71,7 @@ class VirtualProcedure:
     @property
     def raised_m(self) -> tuple[float, ...]:
         """Stated heights of the ball's underside above the floor."""
-        return (0.7, 1.8) if self.hanging else (0.9, 1.7)
+        return HEIGHTS_M[HANGING if self.hanging else STAND][::-1]
 
     @property
     def steps(self) -> tuple[str, ...]:

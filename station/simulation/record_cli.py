@@ -12,6 +12,7 @@ import click
 
 from station.calibration.detect.detections import EMPTY
 from station.core.commands import Number
+from station.core.errors import InputError
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import STRIDE, VirtualProcedure
 from station.simulation.scene import fixed_posts, load_mesh
@@ -75,6 +76,8 @@ def record_virtual(
       station record-virtual --body ann.npz --out demo/booth --calibration 60
       station calibrate --config demo/booth/booth.toml --recordings demo/booth/procedure
     """
+    if hanging and waving_s is None:
+        raise InputError("--hanging is of a calibration: give --calibration SECONDS too")
     bias_m = 0.0 if waving_s is None else _UNIT_BIAS_M
     booth = SimulatedBooth(seed=seed, bias_m=bias_m, clutter=fixed_posts())
     jobs: dict[str, Callable[[], int]] = {

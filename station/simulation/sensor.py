@@ -71,7 +71,7 @@ class SimulatedBooth:
         floor, *walls = booth_walls()
         rng = np.random.default_rng((self.seed, 6))
         floor = uneven(floor, 2, self.uneven_floor_m, rng)
-        if violations.FLOOR in self.violations:
+        if self.violations & {violations.FLOOR, violations.SLOPE}:
             floor = bent(floor, lambda x, y: violations.bow_m(self.violations, self.seed, x, y))
         return [floor, *walls, *self.clutter]
 

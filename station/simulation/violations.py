@@ -25,6 +25,8 @@ K1 = "k1"
 """Radial distortion k1 of 0.02 to 0.045, either sign, unknown to the driver."""
 FLOOR = "floor"
 """Floor bowed by 2 mm."""
+SLOPE = "slope"
+"""Floor that slopes by up to 5 mm per metre. Only a plumb line shows that: none of ``ALL``."""
 BALL = "ball"
 """Ball 0.35 % larger or smaller than stated."""
 OVAL = "oval"
@@ -44,7 +46,7 @@ _BIAS_RMS_M, _BIAS_AT_M = 1.5e-3, 1.7
 _GAIN = (1e-3, 3e-3)
 _FOCAL_SHARE, _CENTER_PX = 2e-3, 1.0
 _K1 = (0.02, 0.045)
-_BOW_M = 2e-3
+_BOW_M, _SLOPE = 2e-3, 5e-3
 _BALL_SHARE, _OVAL_SHARE = 3.5e-3, 1.2e-2
 _FROZEN_SHARE = 0.4
 _RINGS, _BUMPS = 2, 6
@@ -168,30 +170,38 @@ def oval_axis(seed: int, heading_rad: float) -> Array:
 
 
 def bow_m(switches: frozenset[str], seed: int, x: Array, y: Array) -> Array:
-    """Height (...) of the floor above flat at x, y (metres from the mark)."""
+    """Height (...) of the floor above level at x, y (metres from the mark)."""
+    height_m = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+    if SLOPE in switches:
+        rng = _rng(seed, 11)
+        slope, turn = rng.uniform(0.0, _SLOPE), rng.uniform(0.0, 2.0 * np.pi)
+        height_m += slope * (np.cos(turn) * x + np.sin(turn) * y)
     if FLOOR not in switches:
-        return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+        return height_m
     rng = _rng(seed, 6)
     turn, phase, wave = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6), rng.uniform(3.0, 4.5)
     along = np.cos(turn) * x + np.sin(turn) * y
     across = -np.sin(turn) * x + np.cos(turn) * y
     shape = np.cos(2.0 * np.pi * along / wave + phase) - np.cos(phase)
-    return np.asarray(float(rng.choice([-1.0, 1.0])) * _BOW_M * (shape + 0.15 * across**2))
+    return height_m + float(rng.choice([-1.0, 1.0])) * _BOW_M * (shape + 0.15 * across**2)
 
 
-_HOOK_M, _HOOK_HEIGHT_M, _SWING_M = 1.5e-3, 2.45, (5e-4, 4e-3)
-"""Largest shift of the string along its hook from one height to another; the hook's height; ends of
-the amplitude with which a hanging ball still swings."""
+_HOOK_M, _BALANCE_M = 1.5e-3, 1.5e-3
+"""Largest shift of the string along its hook from one height to another, and distance of a ball's
+middle from where its weight hangs, in a direction that turns with the string."""
+_HOOK_HEIGHTS_M, _SWINGS_M = (2.2, 3.0), (5e-4, 8e-3)
+"""Ends of the hook's height, and of the amplitude with which a hanging ball still swings."""
 _GRAVITY_M_S2 = 9.81
 
 
 def hung_m(seed: int, stated_mm: int, height_m: float, time_s: float) -> Array:
     """x, y (2,) of a ball's centre from below the hook on which it hangs."""
-    rng = _rng(seed, 8, stated_mm)
+    once, rng = _rng(seed, 10), _rng(seed, 8, stated_mm)
+    string_m = once.uniform(*_HOOK_HEIGHTS_M) - height_m
     shift = rng.uniform(-_HOOK_M, _HOOK_M, 2)
-    turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-    rate = np.sqrt(_GRAVITY_M_S2 / (_HOOK_HEIGHT_M - height_m))
-    swing = rng.uniform(*_SWING_M) * np.sin(rate * time_s + phase)
+    turn, phase, twist = rng.uniform(0.0, 2.0 * np.pi, 3)
+    swing = rng.uniform(*_SWINGS_M) * np.sin(np.sqrt(_GRAVITY_M_S2 / string_m) * time_s + phase)
+    shift += once.uniform(0.0, _BALANCE_M) * np.array([np.cos(twist), np.sin(twist)])
     return np.asarray(shift + swing * np.array([np.cos(turn), np.sin(turn)]))
 
 

@@ -348,9 +348,21 @@ def test_a_hanging_ball_shows_what_is_vertical() -> None:
     assert distortion(booth, solution.rig, load_mesh(BODY)).tilt_deg < 0.15
 
 
+def test_a_floor_that_slopes_is_not_taken_for_a_hook_that_moved() -> None:
+    """A slope of 4 to 5 mm per metre was refused for ever: the hook was said to have moved."""
+    booth = synthetic.booth(25, switches=(violations.SLOPE,))
+    slope = violations.bow_m(booth.violations, booth.seed, np.eye(2)[0], np.eye(2)[1])
+    assert np.linalg.norm(slope) > 4e-3
+    solution = solved(booth.rig, _hanging(booth, VirtualProcedure))
+    predicted = solution.rig.predicted
+    assert predicted is not None
+    tilt_rad = np.radians(distortion(booth, solution.rig, load_mesh(BODY)).tilt_deg)
+    assert tilt_rad < min(np.radians(0.15), 3.0 * predicted.tilt_sigma_rad)
+
+
 def test_a_hook_that_moved_is_refused(procedure: VirtualProcedure) -> None:
     booth = procedure.booth
-    with pytest.raises(CalibrationError, match=r"hanging ball's places are (19|20|21) mm"):
+    with pytest.raises(CalibrationError, match=r"hanging ball's places are (1[7-9]|2[0-2]) mm"):
         solved(booth.rig, _hanging(booth, _MovedHook))
 
 

@@ -46,12 +46,15 @@ CASES: dict[str, tuple[str, ...]] = {
     "ball": (violations.BALL,),
     "oval": (violations.OVAL,),
     "frozen": (violations.FROZEN,),
+    "slope": (violations.SLOPE,),
     "floor, ball, frozen": (violations.FLOOR, violations.BALL, violations.FROZEN),
     "raw law": (violations.RAW_LAW,),
     "hand, helper": (violations.HAND, violations.HELPER),
     "all": violations.ALL,
 }
 _DIRECT = [name for name in CASES if name != "hand, helper"]
+_HANGING_ONLY = "slope"
+"""Otherwise the world's vertical is the floor's."""
 
 
 def observe(booth: SimulatedBooth, *, images: bool, hanging: bool) -> Observations:
@@ -202,6 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     model = warm_up() if given.scans else None
     cases = given.case or (list(CASES) if given.images else _DIRECT)
+    if not given.hanging:
+        cases = [name for name in cases if name != _HANGING_ONLY]
     print(
         f"{'violated':<20}{'seed':>4}{'pairs':>7}{'worst':>6}{'chi2/n':>7}"
         f"{'cloud rms (sigma)':>14}{'tilt deg':>15}{'height mm':>14}{'girths mean/worst':>18}"

@@ -16,6 +16,7 @@ from typing import Any, cast
 from unittest.mock import patch
 
 from station.calibration.detect.detections import EMPTY, HANGING
+from station.calibration.detect.swing import LOOK_S
 from station.calibration.guide import procedure as guided
 from station.calibration.guide import steps
 from station.calibration.guide.operator import Guide
@@ -119,11 +120,15 @@ def procedure_seconds(*, extras: bool, hangs: bool = False) -> dict[str, float]:
 
     def rest(*given: object) -> None:
         hanging = str(given[-1]).startswith(HANGING)
-        count = steps._HANGING_DETECTIONS if hanging else steps._RESTING_DETECTIONS
-        operator.look(count / INDEPENDENT_HZ + steps._OTHERS_S)()
+        least_s = LOOK_S if hanging else steps._RESTING_DETECTIONS / INDEPENDENT_HZ
+        operator.look(least_s + steps._OTHERS_S)()
 
     session = SimpleNamespace(
-        done=lambda step: step == EMPTY, around_count=0, raised=[], wall_count=0
+        done=lambda step: step == EMPTY,
+        around_count=0,
+        raised=[],
+        raised_as=lambda _: {},
+        wall_count=0,
     )
     config = SimpleNamespace(calibrate=wanted, reference="")
     sessions = chain([None], repeat(session))

@@ -113,6 +113,11 @@ def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPa
     assert laid == [
         ("stand-1700", "Ball on a stand on the mark, its underside 1.7 m above the floor")
     ]
+    assert _run(config, "stand", "--height", "0.7", "--hanging").exit_code == 0
+    assert laid.pop() == (
+        "hanging-700",
+        "Ball hanging above the mark, its underside 0.7 m above the floor",
+    )
     in_cm = _run(config, "stand", "--height", "170")
     assert in_cm.exit_code == 2
     assert "0.3<=x<=2.2" in in_cm.output

@@ -15,7 +15,8 @@ from station.calibration.guide.feed import Feed, TimedFrame
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
-from station.calibration.guide.steps import wave_ball
+from station.calibration.guide.steps import rest_ball, wave_ball
+from station.core.errors import CalibrationError
 from station.core.kinect_v1 import DEPTH_SCALE_M, INDEPENDENT_HZ, TABLE
 from station.sensors.recording import RecordedFrame, check_recording, write_recording
 from station.simulation.scene import default_rig
@@ -79,6 +80,75 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     assert len(before) == 50
     assert sum(ball.camera == _CAMERAS[0] for ball in before) == 25
     assert "3 frames were missed" in capsys.readouterr().out
+
+
+class _Looks:
+    """A feed of one frame of each camera, 20 a second, until ``lasts_s``."""
+
+    replays = True
+    missed = 0
+
+    def __init__(self, lasts_s: float) -> None:
+        self._moments, self._next = round(INDEPENDENT_HZ * lasts_s), 0
+
+    @property
+    def over(self) -> bool:
+        return self._next == self._moments
+
+    def newest(self) -> list[TimedFrame]:
+        self._next += 1
+        image = np.zeros((4, 4), np.uint16)
+        return [TimedFrame(name, self._next / INDEPENDENT_HZ, image, 1e-3) for name in _CAMERAS]
+
+
+def _hung(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, *, lasts_s: float, swing_m: float, every: int = 1
+) -> list[BallDetection]:
+    """The detections kept of a ball that swings; one frame in ``every`` shows it."""
+    rng = np.random.default_rng(3)
+
+    def find(*args: Any, **_: Any) -> BallDetection | None:
+        _, camera, _, time_s = args
+        if round(time_s * INDEPENDENT_HZ) % every:
+            return None
+        phase = 2.0 * np.pi * time_s / 2.3 + 0.7
+        center_m = np.array([swing_m * np.sin(phase), 0.0, 1.5]) + rng.normal(0.0, 5e-4, 3)
+        return BallDetection(
+            camera.name, time_s, center_m, np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4))
+        )
+
+    monkeypatch.setattr(finder, "find_ball", find)
+    rig = default_rig().cameras
+    session = Session.begin(folder, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    guide = Guide(attended=False, countdown_s=0.0)
+    rest_ball(cast(Feed, _Looks(lasts_s)), session, guide, "hanging-1800")
+    return session.around["hanging-1800"]
+
+
+def test_a_swinging_ball_is_averaged_over_whole_swings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over three seconds, the mean was off by up to a fifth of the amplitude."""
+    kept = _hung(tmp_path, monkeypatch, lasts_s=5.0, swing_m=7e-3)
+    for name in _CAMERAS:
+        centers_m = np.array([ball.center_m for ball in kept if ball.camera == name])
+        assert abs(centers_m[:, 0].mean()) < 5e-4
+
+
+def test_a_hanging_ball_that_is_lost_now_and_then_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the edge of an image: 60 detections without a gap were asked for."""
+    kept = _hung(tmp_path, monkeypatch, lasts_s=5.0, swing_m=1e-3, every=2)
+    assert {ball.camera for ball in kept} == set(_CAMERAS)
+
+
+@pytest.mark.parametrize(("lasts_s", "swing_m"), [(3.5, 1e-3), (6.0, 0.05)], ids=["short", "swing"])
+def test_a_ball_that_hangs_too_shortly_or_swings_is_not_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_s: float, swing_m: float
+) -> None:
+    with pytest.raises(CalibrationError, match="no camera sees the ball at rest for 4 s"):
+        _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m)
 
 
 def test_no_more_frames_are_looked_at_than_are_worth_it(

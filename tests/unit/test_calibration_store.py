@@ -196,6 +196,26 @@ def test_a_corrected_height_of_the_stand_replaces_the_wrong_one(tmp_path: Path) 
     assert list(Session.load(tmp_path / "s").around) == ["stand-900", "stand-1700"]
 
 
+@pytest.mark.parametrize(
+    ("told", "kept"),
+    [
+        ("hanging-2000 hanging-500 hanging-1800", "hanging-1800"),
+        ("hanging-1800 hanging-700 hanging-1790", "hanging-1790"),
+        ("hanging-1800 hanging-1790 hanging-700", "hanging-1790 hanging-700"),
+        ("hanging-1800 hanging-700 stand-1700", "hanging-1800 hanging-700 stand-1700"),
+        ("stand-1700 stand-900 hanging-1800", "stand-1700 stand-900 hanging-1800"),
+    ],
+    ids=["another hook", "a height again", "corrected at once", "and a stand", "after a stand"],
+)
+def test_two_heights_of_one_hook_belong_together(tmp_path: Path, told: str, kept: str) -> None:
+    """The old hook's lower place was compared with the new one's upper one."""
+    session = Session.begin(tmp_path / "s", "2026", 0.1, CAMERAS)
+    for step in told.split():
+        session.record_resting(step, [_ball("front-upper", 0.0)])
+    assert session.raised == kept.split()
+    assert Session.load(tmp_path / "s").raised == kept.split()
+
+
 def test_advice_names_what_is_missing() -> None:
     coverage = Coverage(CAMERAS, "front-upper", 0.1)
     assert coverage.share == 0.0

@@ -133,6 +133,103 @@ def test_two_heights_of_the_ball_are_asked_for(
     assert sum(seconds) == COUNTDOWN_S
 
 
+def _raise(
+    guided: tuple[Procedure, Session, list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    heights_m: list[float],
+    *,
+    again: bool = False,
+) -> list[str]:
+    """The questions that are asked until these heights are given."""
+    asked: list[str] = []
+
+    def answer(question: str, **_: object) -> float:
+        asked.append(question)
+        return heights_m.pop(0)
+
+    _answers(monkeypatch, [True])
+    monkeypatch.setattr(click, "prompt", answer)
+    guided[0].raised(again=again)
+    return asked
+
+
+def test_the_height_that_is_missing_is_asked_for(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After the lower one and a restart it asked for the lower one again, and that replaced it."""
+    _, session, _ = guided
+    session.record_resting("hanging-700", [])
+    (question,) = _raise(guided, monkeypatch, [1.8])
+    assert "about 1.8 m above the floor, from the same hook" in question
+    assert session.raised == ["hanging-700", "hanging-1800"]
+    assert _raise(guided, monkeypatch, []) == []
+    assert len(seconds) == COUNTDOWN_S / 2
+
+
+def test_a_second_height_near_the_first_is_not_taken(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, session, _ = guided
+    asked = _raise(guided, monkeypatch, [1.8, 1.75, 0.7])
+    assert len(asked) == 3
+    assert "1.75 m is too near to 1.8 m" in capsys.readouterr().out
+    assert session.raised == ["hanging-1800", "hanging-700"]
+    assert seconds
+
+
+def test_heights_are_shown_again_where_that_is_wanted(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The console's step asked nothing once two heights were there, which a refusal sends to it."""
+    _, session, _ = guided
+    session.record_resting("hanging-1900", [])
+    session.record_resting("hanging-600", [])
+    assert len(_raise(guided, monkeypatch, [1.8, 0.7], again=True)) == 2
+    assert session.raised == ["hanging-1800", "hanging-700"]
+    said = capsys.readouterr().out
+    assert "this replaces what was seen before: hanging-1900, hanging-600" in said
+    assert "now about 0.7 m above the floor, from the same hook" in said
+    assert seconds
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["hanging-low"], "has to end with the height of the ball's underside in millimetres"),
+        (["hanging-700", "hanging-1200", "hanging-1800"], "3 heights of the hanging ball"),
+    ],
+)
+def test_recorded_heights_that_cannot_be_used_are_named(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path, names: list[str], words: str
+) -> None:
+    begun, _, looked = guided
+    for name in [*names, "standing-1200"]:
+        (tmp_path / "recordings" / name).mkdir(parents=True)
+    with pytest.raises(CalibrationError, match=words):
+        replace(begun, recordings=tmp_path / "recordings").raised()
+    assert looked == []
+
+
+def test_all_recorded_heights_are_looked_at(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path
+) -> None:
+    begun, session, looked = guided
+    for name in ("hanging-700", "hanging-1800", "stand-1500", "standing-1200"):
+        (tmp_path / "recordings" / name).mkdir(parents=True)
+    unattended = replace(begun.guide, attended=False)
+    replace(begun, recordings=tmp_path / "recordings", guide=unattended).raised()
+    assert looked == ["hanging-1800", "hanging-700", "stand-1500"]
+    assert session.raised == looked
+
+
 def test_no_stand_is_asked_about_once(
     guided: tuple[Procedure, Session, list[str]],
     monkeypatch: pytest.MonkeyPatch,

@@ -147,11 +147,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
         refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
-    "0.29 degrees: lay the ball at more places on the floor around the mark": partial(
-        refusals.check_slope,
-        places("around-0", "hanging-400", "hanging-1700"),
-        world(slope_sigma_rad=5e-3),
-    ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
         refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])
     ),

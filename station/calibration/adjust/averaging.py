@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 
 from station.calibration.adjust.contacts import Belief, Contacts, beliefs
 from station.calibration.adjust.mixture import Mixture
-from station.calibration.adjust.priors import priors, shape_precision
+from station.calibration.adjust.priors import priors, shape_precision, slope_sigma
 from station.calibration.adjust.problem import (
     Doubt,
     Indices,
@@ -134,6 +134,8 @@ class _Base:
     shape: Indices
     shape_precision: Array
     radius_m: float
+    slope_sigma: Array
+    """(9,) that a sloping floor adds to its bow."""
     log_belief: float = 0.0
     """Log-probability of a belief and of what it says of the contacts at the state."""
 
@@ -167,7 +169,7 @@ class _Base:
         return cls(
             tuple(problem.cameras), information, gradient, values, groups, fields,
             model.field_precision, layout.shapes, shape_precision(problem, layout),
-            problem.radius_m,
+            problem.radius_m, slope_sigma(problem),
         )  # fmt: skip
 
     def under(self, contacts: Contacts, belief: Belief) -> _Base:
@@ -267,10 +269,11 @@ class _SmoothChoice:
         """Diagonal of a class's prior information."""
         scales = {RADIUS: np.array([self._base.radius_m]), BOW: BOW_TOLERANCE}
         scale = scales.get(name, np.ones(1))
+        added = self._base.slope_sigma if name == BOW else np.zeros(1)
         groups = self._base.groups[name]
         return np.concatenate(
             [
-                np.ones(len(group)) * (sigma(name, level) * scale) ** -2.0
+                np.ones(len(group)) * np.hypot(sigma(name, level) * scale, added) ** -2.0
                 for group, level in zip(groups, option.levels, strict=True)
             ]
         )

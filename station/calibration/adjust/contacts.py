@@ -25,9 +25,10 @@ CONTACT_M = 0.0005
 """Standard deviation of a ball's height on an even floor."""
 TAPE_M = 0.001
 """Standard deviation of a height that was measured with a tape."""
-PLUMB_M = 0.0012
+PLUMB_M = 0.0015
 """Standard deviation, along each horizontal axis, of a ball's places above one another that hangs
-from one hook at two heights: the string lies otherwise on the hook, and the ball still swings."""
+from one hook at two heights: the string lies otherwise on the hook, and the ball, whose middle need
+not hang below its knot, has turned."""
 PLUMB = "plumb"
 """Name of the plumb line among the places."""
 _TAIL = 4.0
@@ -35,10 +36,11 @@ _TAIL = 4.0
 _SURE_TAIL = 20.0
 """Degrees of freedom of a measured height and a plumb line, which are hardly wrong: sensors whose
 errors have an unexpected form must not push them aside."""
-_FLOOR_WRONG, _HEIGHT_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.02
+_FLOOR_WRONG, _HEIGHT_WRONG, _ALL_WRONG, _HOOK_WRONG = 3e-4, 0.06, 0.05, 0.1
 """Odds against all being as was said, of something that lies under the ball at one place, of one
 height that was measured wrongly, of all heights being wrong by the same amount (measured with a
-tape whose hook is loose, or from a carpet), and of a hook that moved between two heights."""
+tape whose hook is loose, or from a carpet), and of a string that was hung elsewhere between two
+heights."""
 _ONE_WRONG_M, _ALL_WRONG_M, _HOOK_WRONG_M = 0.015, 0.008, 0.008
 """Standard deviations of these errors."""
 
@@ -159,7 +161,7 @@ def _plumb(layout: Layout, state: State, low: str, high: str) -> tuple[Array, Ar
     """Derivatives (2, m) of how far one place is from above another along two horizontal axes, and
     how far it is (2,), metres.
 
-    The horizontal is the level of the whole floor, whose lean at the mark is part of its bow.
+    The horizontal is that of the floor's plane, from which the floor itself may slope.
     """
     q = state.planes[FLOOR]
     length = np.linalg.norm(q)

@@ -330,8 +330,8 @@ def _design(
 def bow_terms(points: Array, mark: Array, up: Array) -> Array:
     """Terms (n, 9) of the floor's bow at points (n, 3), about the mark.
 
-    The plane takes up the linear ones: with them, it is the level of the whole floor and not that
-    of the floor at the mark, and its slope is known no better than a bowed floor leans there.
+    The linear ones are what the floor leans at the mark from the plane. Only a plumb line tells
+    them from the plane's own slope, which is otherwise known no better than a bowed floor leans.
     """
     first, second = level_axes(up)
     away = points - mark

@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from station.calibration.adjust.ball_shape import SHAPE
-from station.calibration.adjust.problem import Indices, Layout, Problem, State
+from station.calibration.adjust.contacts import plumb_ends
+from station.calibration.adjust.problem import BOW_SIZE, Indices, Layout, Problem, State
 from station.calibration.adjust.sensor_model import LAW, LAW_DIFFERENCE, LAW_SIGMA
 from station.calibration.adjust.widths import BOW, BOW_TOLERANCE, RADIUS, sigma
 
 Array = NDArray[np.float64]
 
+_FLOOR_SLOPE = 3e-3
+"""Standard deviation of a whole floor's slope along each axis. Levelness numbers F_L of 13 to 25,
+those of ordinary floors (ASTM E1155), are slopes of 4 to 8 mm per metre that 95 % keep."""
 _CONSTANT_SHAPE = 0.5
 """Share of the variance of a ball's shape that stays while it is waved."""
 CLOCK_TOLERANCE_S = 0.005
@@ -50,11 +54,23 @@ def priors(problem: Problem, layout: Layout, state: State) -> Iterator[Prior]:
     radius_sigma_m = sigma(RADIUS, widths.radius) * problem.radius_m
     off_m = np.array([state.radius_m - problem.radius_m])
     yield Prior(layout.radius, np.array([[radius_sigma_m**-2.0]]), off_m)
-    bow_sigma = sigma(BOW, widths.bow) * BOW_TOLERANCE
+    bow_sigma = np.hypot(sigma(BOW, widths.bow) * BOW_TOLERANCE, slope_sigma(problem))
     yield Prior(layout.bow, np.diag(bow_sigma**-2.0), state.bow)
     if len(layout.shapes):
         precision = shape_precision(problem, layout) / widths.shape**2
         yield Prior(layout.shapes, precision, shape_values(state))
+
+
+def slope_sigma(problem: Problem) -> Array:
+    """Standard deviations (9,) of what a whole floor's slope adds to its bow, metres at 1 m.
+
+    Where a plumb line shows what is vertical the floor's plane is level, and the floor may slope
+    from it; otherwise the plane has the slope of the floor.
+    """
+    slopes = np.zeros(BOW_SIZE)
+    if plumb_ends(problem) is not None:
+        slopes[:2] = _FLOOR_SLOPE
+    return slopes
 
 
 def shape_precision(problem: Problem, layout: Layout) -> Array:

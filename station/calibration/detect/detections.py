@@ -29,6 +29,8 @@ EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND, HANGING = (
 "stand-1700" and "hanging-1800" by the height in millimetres."""
 RAISED = (STAND, HANGING)
 """Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
+HEIGHTS_M: Mapping[str, tuple[float, float]] = {STAND: (1.7, 0.9), HANGING: (1.8, 0.7)}
+"""Heights of the raised ball's underside that serve best, the upper one first."""
 PLACES = (AROUND, *RAISED)
 """Steps of the resting ball that may be repeated elsewhere."""
 FLOOR = "floor"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,6 +14,7 @@ from station.calibration.detect.detections import (
     EMPTY,
     FRONT,
     HANGING,
+    HEIGHTS_M,
     MARK,
     PLACES,
     RAISED,
@@ -50,19 +51,8 @@ _HOOK = (
     "For accurate heights, the ball stands on a stand, or hangs on a string from a hook above the "
     "mark and also shows what is vertical. Does it hang?"
 )
-_HEIGHTS = {
-    STAND: (
-        "Put the ball on a stand on the mark, best as high as a head. How high is its underside "
-        "above the floor?",
-        "Now about half as high: a wrong measurement shows. How high is its underside?",
-    ),
-    HANGING: (
-        "Hang the ball a little higher than a head, and wait until it hangs still. How high is its "
-        "underside above the floor?",
-        "Now as high as a table, from the same hook, and still. How high is its underside?",
-    ),
-}
-"""A question for each height of the ball."""
+_APART_M = 0.5
+"""Two heights of the ball that are nearer to each other than this say little more than one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,28 +204,77 @@ class Procedure:
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
 
-    def raised(self) -> None:
-        """The ball at two measured heights that the operator gives; at all that are recorded."""
+    def raised(self, *, again: bool = False) -> None:
+        """The ball at two measured heights that the operator gives; at all that are recorded.
+
+        ``again``: also where it was seen at two heights already.
+        """
         if self.recordings is not None:
-            for folder in sorted(self.recordings.glob("*-*")):
-                if folder.name.startswith(RAISED):
-                    kind, _, millimetres = folder.name.partition("-")
-                    known = millimetres.isdecimal()
-                    self.raise_ball(1e-3 * int(millimetres) if known else float("nan"), kind)
+            self._raised_in(self.recordings)
             return
         session = self._session_to_add_to()
-        before = session.raised if session else []
-        if len(before) >= len(_HEIGHTS[STAND]) or not self.guide.attended:
+        seen = {kind: list(session.raised_as(kind).values()) if session else [] for kind in RAISED}
+        complete = any(len(own) >= len(HEIGHTS_M[kind]) for kind, own in seen.items())
+        if (complete and not again) or not self.guide.attended:
             return
         self.guide.title("Ball at two heights")
-        hangs = (
-            before[0].startswith(HANGING) if before else self.guide.answers_yes(_HOOK, usual=False)
-        )
-        kind = HANGING if hangs else STAND
-        for question in _HEIGHTS[kind][len(before) :]:
-            if (height_m := self.guide.height_m(question)) is None:
+        begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
+        kind = begun or (HANGING if self.guide.answers_yes(_HOOK, usual=False) else STAND)
+        others_m = seen[kind] if begun else []
+        best_m = list(HEIGHTS_M[kind])
+        if begun:
+            best_m = [max(best_m, key=lambda height_m: abs(height_m - others_m[0]))]
+        for about_m in best_m:
+            height_m = self._measured_m(kind, about_m, others_m)
+            if height_m is None:
                 return
             self.raise_ball(height_m, kind, ready=True)
+            others_m.append(height_m)
+
+    def _raised_in(self, recordings: Path) -> None:
+        """The ball at all heights that are recorded."""
+        kinds = {
+            folder: folder.name.partition("-")[0]
+            for folder in sorted(recordings.glob("*-*"))
+            if folder.name.partition("-")[0] in RAISED
+        }
+        if (hung := list(kinds.values()).count(HANGING)) > len(HEIGHTS_M[HANGING]):
+            raise CalibrationError(
+                f"{recordings} holds {hung} heights of the hanging ball: keep two, from one hook"
+            )
+        for folder, kind in kinds.items():
+            millimetres = folder.name.partition("-")[2]
+            if not millimetres.isdecimal():
+                raise CalibrationError(
+                    f"{folder} cannot be used: its name has to end with the height of the ball's "
+                    f"underside in millimetres, such as {kind}-1700"
+                )
+            self.raise_ball(1e-3 * int(millimetres), kind)
+
+    def _measured_m(self, kind: str, about_m: float, others_m: Sequence[float]) -> float | None:
+        """Height that the operator gives, not near one that was seen; None if left out."""
+        if kind == STAND:
+            where = (
+                f"Now about {about_m:g} m above the floor: a wrong measurement shows."
+                if others_m
+                else f"Put the ball on a stand on the mark, about {about_m:g} m above the floor."
+            )
+        else:
+            where = (
+                f"Now about {about_m:g} m above the floor, from the same hook, and still."
+                if others_m
+                else f"Hang the ball above the mark, about {about_m:g} m above the floor, and wait "
+                "until it hangs still."
+            )
+        while (height_m := self.guide.height_m(f"{where} How high is its underside?")) is not None:
+            near_m = [other for other in others_m if abs(other - height_m) < _APART_M]
+            if not near_m:
+                break
+            self.guide.say(
+                f"{height_m:g} m is too near to {near_m[0]:g} m, at which it was seen already: "
+                f"change its height by {_APART_M:g} m or more"
+            )
+        return height_m
 
     def raise_ball(self, height_m: float, kind: str, *, ready: bool = False) -> None:
         """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
@@ -259,6 +298,20 @@ class Procedure:
                 where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
                 instruction = "Put it up and step back."
             self._lay(step, f"Ball {where}", instruction)
+
+    def _say_what_is_left(self, session: Session, step: str, before: Sequence[str]) -> None:
+        """Name the heights of the ball that were replaced, and the one that is missing."""
+        gone = [place for place in before if place not in session.raised]
+        if gone:
+            self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
+        own_m = list(session.raised_as(HANGING).values())
+        if step.startswith(HANGING) and len(own_m) == 1 and self.recordings is None:
+            upper_m, lower_m = HEIGHTS_M[HANGING]
+            other_m = lower_m if own_m[0] > 0.5 * (upper_m + lower_m) else upper_m
+            self.guide.say(
+                f"now about {other_m:g} m above the floor, from the same hook, and still: two "
+                "heights show what is vertical"
+            )
 
     def walls(self, asked: bool) -> None:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
@@ -337,7 +390,9 @@ class Procedure:
     def _see_at_rest(self, step: str) -> None:
         with self._feed(step) as (feed, session):
             self._remark_on_ghosts(session)
+            before = session.raised
             rest_ball(feed, session, self.guide, step)
+            self._say_what_is_left(session, step, before)
 
     def _remark_on_ghosts(self, session: Session) -> None:
         if not session.done(EMPTY):

@@ -22,6 +22,7 @@ from station.calibration.detect.detections import (
     BALL,
     EMPTY,
     FRONT,
+    HANGING,
     MARK,
     PLACES,
     RAISED,
@@ -43,8 +44,10 @@ JOURNAL, SCENE = "observations.jsonl", "scene"
 
 Seen = TypeVar("Seen", BallDetection, PlaneObservation)
 
-_SAME_STAND_M = 0.15
-"""Heights of the stand that are nearer to each other are a measurement and its correction."""
+_SAME_HEIGHT_M = 0.15
+"""Heights of the ball that are nearer to each other are a measurement and its correction."""
+_HOOK_HEIGHTS = 2
+"""Heights at which the ball hangs from one hook."""
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
@@ -73,7 +76,7 @@ class Session:
     planes: dict[str, list[PlaneObservation]] = field(default_factory=dict)
     """Step -> the surfaces seen in it."""
     around: dict[str, list[BallDetection]] = field(default_factory=dict)
-    """Place -> the ball resting on the floor there."""
+    """Place -> the ball resting there: on the floor, on a stand, or hanging."""
     lenses: dict[str, Lens] = field(default_factory=dict)
     adds_to: str = ""
     """Name of the stored calibration that was taken up again."""
@@ -214,6 +217,15 @@ class Session:
         """Steps in which the ball was seen at a measured height."""
         return [place for place in self.around if place.startswith(RAISED)]
 
+    def raised_as(self, kind: str) -> dict[str, float]:
+        """Steps in which the ball was on a stand, or hung (STAND, HANGING), and their heights."""
+        heights_m = {place: raised_height_m(place) for place in self.raised}
+        return {
+            place: height_m
+            for place, height_m in heights_m.items()
+            if height_m is not None and place.startswith(kind)
+        }
+
     @property
     def wall_count(self) -> int:
         return sum(name.startswith(WALL) for name in self.planes)
@@ -292,7 +304,7 @@ class Session:
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
         elif step.startswith(PLACES):
-            for other in [name for name in self.around if _same_height(name, step)]:
+            for other in self._replaced_by(step):
                 del self.around[other]
             self.around[step] = self._balls(entry)
         elif step == "board":
@@ -303,6 +315,17 @@ class Session:
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
+
+    def _replaced_by(self, step: str) -> list[str]:
+        """Places that the ball at a height replaces: the same height, measured wrongly; or both
+        at which it hung before, maybe from another hook."""
+        height_m = raised_height_m(step)
+        if height_m is None:
+            return []
+        own = self.raised_as(step.partition("-")[0])
+        if step.startswith(HANGING) and len(own) == _HOOK_HEIGHTS:
+            return list(own)
+        return [other for other, its_m in own.items() if abs(its_m - height_m) < _SAME_HEIGHT_M]
 
     def _balls(self, entry: Mapping[str, Any]) -> list[BallDetection]:
         return self._known([BallDetection.from_json(ball) for ball in entry["balls"]])
@@ -324,11 +347,3 @@ class Session:
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
         return self._later_s
-
-
-def _same_height(step: str, other: str) -> bool:
-    """Whether both are one height of the ball, of which the first was measured wrongly."""
-    first_m, second_m = raised_height_m(step), raised_height_m(other)
-    if first_m is None or second_m is None:
-        return False
-    return abs(first_m - second_m) < _SAME_STAND_M

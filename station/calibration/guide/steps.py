@@ -11,6 +11,7 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import HANGING, BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import smoothed, static_view
+from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
@@ -23,8 +24,8 @@ _EMPTY_FRAMES = 60
 _WALL_FRAMES = 30
 _RESTING_S = 60.0
 _RESTING_DETECTIONS = 12
-_HANGING_DETECTIONS = 60
-"""Three seconds: more than a swing of a string of 2 m."""
+_HANGING_DETECTIONS = 24
+"""In ``LOOK_S``: a camera that loses the ball in some frames still sees where it hangs."""
 _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
 _OTHERS_S = 3.0
@@ -118,8 +119,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
     Raises:
         CalibrationError: it was not seen at rest.
     """
-    # What still swings a little is averaged over more than a swing.
-    count = _HANGING_DETECTIONS if step.startswith(HANGING) else _RESTING_DETECTIONS
+    hangs = step.startswith(HANGING)
     recent: dict[str, list[BallDetection]] = {name: [] for name in session.cameras}
     still: dict[str, list[BallDetection]] = {}
     now_s = time.monotonic()
@@ -129,29 +129,47 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
             finder.submit(feed.newest())
             for ball in finder.found():
                 recent[ball.camera].append(ball)
-            still = {name: seen for name, seen in recent.items() if _at_rest(seen, count)}
+            still = _at_rest(recent, hangs=hangs)
             guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
             now_s = time.monotonic()
             if still:
                 settled_s = min(settled_s, now_s + _OTHERS_S)
         for ball in finder.found(wait=True):
             recent[ball.camera].append(ball)
-    still = {name: seen for name, seen in recent.items() if _at_rest(seen, count)}
+    still = _at_rest(recent, hangs=hangs)
     if not still:
+        seen_s = f" for {LOOK_S:g} s" if hangs else ""
         raise CalibrationError(
-            "no camera sees the ball at rest: put it where a camera sees it (on the floor, a lower "
-            "one), take your hands away, wait until it hangs still if it hangs, and check that its "
-            f"radius is {session.radius_m:g} m (calibrate.ball_radius_m)"
+            f"no camera sees the ball at rest{seen_s}: put it where a camera sees it (one on the "
+            "floor is seen by lower cameras), take your hands away, wait until it hangs still if "
+            f"it hangs, and check that its radius is {session.radius_m:g} m "
+            "(calibrate.ball_radius_m)"
         )
-    kept = [ball for seen in still.values() for ball in seen[-count:]]
-    session.record_resting(step, kept)
+    session.record_resting(step, [ball for kept in still.values() for ball in kept])
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
 
 
-def _at_rest(seen: list[BallDetection], count: int) -> bool:
-    if len(seen) < count:
-        return False
-    centers = np.array([ball.center_m for ball in seen[-count:]])
+def _at_rest(
+    recent: dict[str, list[BallDetection]], *, hangs: bool
+) -> dict[str, list[BallDetection]]:
+    """The detections to keep of each camera that sees the ball at rest."""
+    kept = {name: _last(seen, hangs=hangs) for name, seen in recent.items()}
+    return {name: seen for name, seen in kept.items() if seen and _is_still(seen)}
+
+
+def _last(seen: list[BallDetection], *, hangs: bool) -> list[BallDetection]:
+    """The last detections of one camera: enough of them, or none."""
+    if not hangs:
+        return seen[-_RESTING_DETECTIONS:] if len(seen) >= _RESTING_DETECTIONS else []
+    if not seen or seen[-1].time_s - seen[0].time_s < LOOK_S:
+        return []
+    last = [ball for ball in seen if ball.time_s >= seen[-1].time_s - LOOK_S]
+    # What still swings a little is averaged over whole swings.
+    return whole_swings(last) if len(last) >= _HANGING_DETECTIONS else []
+
+
+def _is_still(seen: list[BallDetection]) -> bool:
+    centers = np.array([ball.center_m for ball in seen])
     away = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     return bool(np.median(away) < _RESTING_M)
 

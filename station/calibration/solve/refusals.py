@@ -8,14 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.contacts import PLUMB, plumb_ends
+from station.calibration.adjust.contacts import PLUMB
 from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import (
     AROUND,
     FRONT,
+    HANGING,
+    HEIGHTS_M,
     MARK,
+    STAND,
     BallDetection,
     Observations,
 )
@@ -52,21 +55,19 @@ _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
 SIGMAS_95 = 1.96
 _START_AGAIN = "fix it, and start again with station calibrate --new"
-STAND_WORDS = "put the ball on a stand of measured height (station calibrate stand --height 1.7)"
+STAND_WORDS = (
+    "put the ball on a stand of measured height (station calibrate stand --height "
+    f"{HEIGHTS_M[STAND][0]:g})"
+)
 HANGING_WORDS = (
     "hang the ball from one and the same hook at two heights, and let it come to rest (station "
-    "calibrate stand --hanging --height 1.8, then --height 0.7)"
+    f"calibrate stand --hanging --height {HEIGHTS_M[HANGING][0]:g}, then --height "
+    f"{HEIGHTS_M[HANGING][1]:g})"
 )
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
     "lay the ball to the left, to the right and behind the mark, 0.6 m away, where a lower camera "
     "sees it (station calibrate around)"
-)
-
-
-_MORE_AROUND_WORDS = (
-    "lay the ball at more places on the floor around the mark, where a lower camera sees it "
-    "(station calibrate around)"
 )
 
 
@@ -222,7 +223,7 @@ def slope_words(problem: Problem) -> str:
     """Advice against a doubtful slope: of what helps, the next that was not done."""
     if not any(place.startswith(AROUND) for place in problem.resting):
         return AROUND_WORDS
-    return HANGING_WORDS if plumb_ends(problem) is None else _MORE_AROUND_WORDS
+    return HANGING_WORDS
 
 
 def check_predicted(
@@ -261,18 +262,20 @@ def check_doubts(problem: Problem, state: State) -> None:
     worst = state.doubts[0]
     if worst.places[0] in problem.heights_m:
         heights = ", ".join(f"{problem.heights_m[place]:.3f}" for place in worst.places)
+        hung = any(place.startswith(HANGING) for place in worst.places)
+        again = HANGING_WORDS if hung else "repeat that step (station calibrate stand --height ...)"
         raise CalibrationError(
             f"the ball at the height of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
             f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
-            "the floor again, and repeat that step (station calibrate stand --height ..., with "
-            "--hanging where it hung); if it was right, let the sensors warm up and wave the ball "
-            "again"
+            f"the floor again, and {again}; if it was right, let the sensors warm up and wave the "
+            "ball again"
         )
     if worst.places == (PLUMB,):
         raise CalibrationError(
             f"the hanging ball's places are {1e3 * worst.off_m:.0f} mm from above one another: "
-            f"{HANGING_WORDS}; if it did hang so, take away what lay under the ball on the floor, "
-            "and start again with station calibrate --new"
+            f"{HANGING_WORDS}; if it did hang so, something lay under the ball on the floor, or "
+            "the floor slopes by more than 5 mm per metre: take it away, or put the ball on a "
+            "stand, and start again with station calibrate --new"
         )
     raise CalibrationError(
         "the places of the ball on the floor do not lie on one floor (one is "

@@ -105,7 +105,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "around":
                 procedure.around(asked=False)
             case "stand":
-                procedure.raised()
+                procedure.raised(again=True)
             case "depth":
                 procedure.walls(asked=False)
             case "solve":
