@@ -14,6 +14,7 @@ from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.spool import Spool
 
+_LIMIT = click.IntRange(1, 1_000_000)
 _WORDS = {
     "accepted": "waiting",
     "reconstructing": "reconstructing",
@@ -27,7 +28,11 @@ _WORDS = {
 @config_option
 @click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
 @click.option(
-    "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
+    "--limit",
+    type=_LIMIT,
+    default=20,
+    show_default=True,
+    help="largest number of scans to list, newest first",
 )
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
 def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
@@ -46,7 +51,11 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
 @click.argument("text")
 @config_option
 @click.option(
-    "--limit", default=20, show_default=True, help="largest number of scans to list, newest first"
+    "--limit",
+    type=_LIMIT,
+    default=20,
+    show_default=True,
+    help="largest number of scans to list, newest first",
 )
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
 def find(text: str, config_path: Path | None, limit: int, as_json: bool) -> None:

@@ -15,7 +15,7 @@ import click
 from station.archive.tables import printed_table, read_measurements
 from station.booth.health import booth_health, reports
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
-from station.core.commands import config_option
+from station.core.commands import Number, config_option
 from station.core.config import BoothConfig, find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
@@ -27,6 +27,7 @@ _POLL_S = 0.05
 _EXIT_RESCAN = 3
 _UNSURE_S = 15.0
 """Time within which a process that hangs is restarted and the outcome of a scan is known again."""
+_TIMEOUT = Number(0.0, 86400.0, unit="seconds")
 _LOCKS = (STATION_LOCK, "control.lock", "sync.lock")
 _WORDS = {
     "armed": "waiting for the cameras",
@@ -45,7 +46,9 @@ def _command(config: BoothConfig, request: Request) -> dict[str, Any]:
 
 @click.command()
 @config_option
-@click.option("--timeout", "timeout_s", default=20.0, help="seconds to wait for all cameras")
+@click.option(
+    "--timeout", "timeout_s", type=_TIMEOUT, default=20.0, help="seconds to wait for all cameras"
+)
 def start(config_path: Path | None, timeout_s: float) -> None:
     """Start the sensors and wait until every camera sends frames.
 
@@ -174,7 +177,9 @@ def _show_status(content: Mapping[str, Any]) -> None:
 )
 @click.option("--scan-id", default=None, help="scan id, to repeat a command for the same scan")
 @click.option("--wait/--no-wait", default=True, help="wait for the result")
-@click.option("--timeout", "timeout_s", default=180.0, help="seconds to wait for the result")
+@click.option(
+    "--timeout", "timeout_s", type=_TIMEOUT, default=180.0, help="seconds to wait for the result"
+)
 def scan(
     config_path: Path | None, label: str, scan_id: str | None, wait: bool, timeout_s: float
 ) -> None:

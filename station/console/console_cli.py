@@ -75,7 +75,11 @@ def token() -> None:
     "--scope", "scopes", type=click.Choice(SCOPES), multiple=True, default=("read",),
     show_default=True, help="read: see scans; scan: take scans; manage: delete, calibrate",
 )  # fmt: skip
-@click.option("--days", type=Number(min=0.0), help="the token expires after this many days")
+@click.option(
+    "--days",
+    type=Number(0.0, 36500.0, min_open=True),
+    help="the token expires after this many days",
+)
 @config_option
 def make(
     name: str, scopes: tuple[Scope, ...], days: float | None, config_path: Path | None
@@ -127,4 +131,7 @@ def _vault(config_path: Path | None) -> Vault:
 
 
 def _day(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+    try:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+    except (ValueError, OverflowError):
+        return "a day beyond the calendar"

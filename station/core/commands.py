@@ -34,13 +34,26 @@ _NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
 class Number(click.FloatRange):
     """A number in a range. NaN lies in every range of click's own."""
 
+    def __init__(
+        self, low: float | None = None, high: float | None = None, *, unit: str = "", **kwargs: bool
+    ) -> None:
+        super().__init__(low, high, **kwargs)
+        self._unit = f", in {unit}" if unit else ""
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        number = float(super().convert(value, param, ctx))
+        try:
+            number = float(super().convert(value, param, ctx))
+        except click.BadParameter:
+            number = math.nan
         if not math.isfinite(number):
-            self.fail(f"{value} is not a number.", param, ctx)
+            point = " (write a point, 1.8)" if "," in str(value) else ""
+            self.fail(f"{value} is not a number{self._range()}{self._unit}{point}.", param, ctx)
         return number
+
+    def _range(self) -> str:
+        return "" if self.min is None and self.max is None else f" {self._describe_range()}"
 
 
 class LazyGroup(click.Group):

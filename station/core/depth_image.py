@@ -22,6 +22,15 @@ Indices = NDArray[np.int64]
 JUMP_RATIO = 0.02
 """Neighbouring readings of one surface differ by less than this share of their depth a pixel."""
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_START = _PNG_SIGNATURE + b"\0\0\0\x0dIHDR"
+"""The first chunk of 13 bytes begins every file."""
+_SHORTEST_PNG = 57
+"""Bytes of a file whose IDAT chunk is empty."""
+_ANIMATED = b"acTL"
+_CRITICAL = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
+"""Chunks without which an image cannot be read; the names of no others begin with a capital."""
+_LARGEST_PIXEL = 8
+"""Bytes."""
 _PLAIN_GREY16 = bytes([16, 0, 0, 0, 0])
 """Depth, colour, compression, filter method and interlacing of the images that are read here."""
 _UNFILTERED, _SUB = 0, 1
@@ -124,10 +133,12 @@ def png_of(depth: NDArray[np.uint16]) -> bytes:
     """Content of a 16-bit PNG file.
 
     Raises:
-        ValueError: the image cannot be written.
+        ValueError: it is no image (h, w) of 16-bit values.
     """
     import cv2
 
+    if depth.dtype != np.uint16 or depth.ndim != 2 or not depth.size:
+        raise ValueError(f"{depth.dtype} {depth.shape} is no image of 16-bit values")
     # A sensor has few distinct depths: whole readings repeat, differences of neighbours do not. So
     # files are smaller unfiltered, and quicker to write and to read.
     fast = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)
@@ -139,7 +150,7 @@ def png_of(depth: NDArray[np.uint16]) -> bytes:
 
 def png_size(data: bytes) -> tuple[int, int] | None:
     """Height and width from a PNG file's first chunk; None if it is torn or not a PNG."""
-    if not data.startswith(_PNG_SIGNATURE) or data[12:16] != b"IHDR" or data[-8:-4] != b"IEND":
+    if len(data) < _SHORTEST_PNG or not data.startswith(_PNG_START) or data[-8:-4] != b"IEND":
         return None
     width, height = struct.unpack(">II", data[16:24])
     return height, width
@@ -155,12 +166,18 @@ def image_of_png(data: bytes) -> NDArray[np.uint8 | np.uint16] | None:
     packed = _image_data(data)
     if packed is None:
         return None
-    if data[24:29] == _PLAIN_GREY16:
-        width, height = struct.unpack(">II", data[16:24])
-        rows = _inflated(packed, (height, 1 + 2 * width))
-        if rows is None:
+    width, height = struct.unpack(">II", data[16:24])
+    plain = data[24:29] == _PLAIN_GREY16
+    # Twice as much as its rows: interlaced ones have a few bytes more.
+    rows = 1 + 2 * width if plain else 2 * (1 + _LARGEST_PIXEL * width)
+    content = _inflated(packed, height * rows)
+    if content is None:
+        return None
+    if plain:
+        if len(content) != height * rows:
             return None
-        image = _unfiltered(rows[:, 0], rows[:, 1:])
+        by_row = np.frombuffer(content, np.uint8).reshape(height, rows)
+        image = _unfiltered(by_row[:, 0], by_row[:, 1:])
         if image is not None:
             return image
     import cv2
@@ -170,30 +187,44 @@ def image_of_png(data: bytes) -> NDArray[np.uint8 | np.uint16] | None:
 
 
 def _image_data(data: bytes) -> bytes | None:
-    """The compressed rows, from all IDAT chunks; None if a chunk is torn."""
-    at, pieces = len(_PNG_SIGNATURE), []
+    """The compressed rows, from all IDAT chunks; None if a chunk is torn or out of its order."""
+    at, names, pieces = len(_PNG_SIGNATURE), [], []
     while at + 12 <= len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])
         content = data[at + 4 : at + 8 + length]
         if data[at + 8 + length : at + 12 + length] != struct.pack(">I", zlib.crc32(content)):
             return None
-        if content.startswith(b"IDAT"):
+        names.append(content[:4])
+        if names[-1] == b"IDAT":
             pieces.append(content[4:])
         at += 12 + length
-    return b"".join(pieces) if at == len(data) else None
+    whole = at == len(data) and names[-1:] == [b"IEND"]
+    return b"".join(pieces) if whole and _in_order(names) else None
 
 
-def _inflated(packed: bytes, shape: tuple[int, int]) -> NDArray[np.uint8] | None:
-    """The image's rows, each after the byte of its filter; None if they are torn."""
-    rows, columns = shape
-    # One byte more than there must be, and never what a small file may claim to hold.
+def _in_order(names: list[bytes]) -> bool:
+    """Whether chunks, the first and last of which are known, are those of one still image."""
+    first = names.index(b"IDAT") if b"IDAT" in names else 0
+    count = names.count(b"IDAT")
+    return (
+        count > 0
+        and names[first : first + count] == [b"IDAT"] * count
+        and names.count(b"IHDR") == names.count(b"IEND") == 1
+        and _ANIMATED not in names
+        and all(name in _CRITICAL for name in names if name[:1].isupper())
+    )
+
+
+def _inflated(packed: bytes, most: int) -> bytes | None:
+    """The image's rows, each after the byte of its filter; None if they are torn or too many."""
+    stream = isal_zlib.decompressobj()
     try:
-        content = isal_zlib.decompressobj().decompress(packed, rows * columns + 1)
+        # One byte more than there may be, and never what a small file may claim to hold.
+        content = stream.decompress(packed, most + 1)
     except isal_zlib.error:  # type: ignore[misc]  # its stub declares an instance
         return None
-    return (
-        np.frombuffer(content, np.uint8).reshape(shape) if len(content) == rows * columns else None
-    )
+    # At its end the stream's checksum has been compared.
+    return bytes(content) if stream.eof and not stream.unused_data else None
 
 
 def _unfiltered(filters: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> NDArray[np.uint16] | None:

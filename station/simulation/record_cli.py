@@ -29,6 +29,9 @@ _UNIT_BIAS_M = 0.010
 _PROCESSES = 2
 
 
+_COUNT, _SEED = click.IntRange(1), click.IntRange(0)
+
+
 @click.command()
 @click.option(
     "--body",
@@ -38,9 +41,27 @@ _PROCESSES = 2
 @click.option(
     "--out", "out_folder", type=click.Path(path_type=Path), required=True, help="folder to write"
 )
-@click.option("--seed", default=0, show_default=True, help="of the noise and the clocks")
-@click.option("--frames", default=30, show_default=True, help="different frames per camera")
-@click.option("--passes", default=40, show_default=True, help="number of times they are repeated")
+@click.option(
+    "--seed",
+    type=_SEED,
+    default=0,
+    show_default=True,
+    help="of the noise and the clocks",
+)
+@click.option(
+    "--frames",
+    type=_COUNT,
+    default=30,
+    show_default=True,
+    help="different frames per camera",
+)
+@click.option(
+    "--passes",
+    type=_COUNT,
+    default=40,
+    show_default=True,
+    help="number of times they are repeated",
+)
 @click.option(
     "--driver",
     type=click.Choice(["freenect", "recorded"]),

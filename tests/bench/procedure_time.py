@@ -46,7 +46,7 @@ class _NoFeed:
         pass
 
     def __enter__(self) -> tuple[None, SimpleNamespace]:
-        return None, SimpleNamespace(balls=())
+        return None, SimpleNamespace(balls=(), raised=[], raised_as=lambda _: {})
 
     def __exit__(self, *_: object) -> None:
         pass

@@ -109,8 +109,8 @@ SPOKEN = [
     "camera front sends no frames; check its cable",
     "there is no scan with the label head",
     "the ball at the height of 1.710 m was seen 10 mm too low: measure the height of its underside "
-    "above the floor again, and repeat that step (station calibrate stand --height ...); if it was "
-    "right, let the sensors warm up and wave the ball again",
+    "above the floor again, and show the ball at its heights anew (station calibrate stand); if it "
+    "was right, let the sensors warm up and wave the ball again",
     "the calibration that was started at 2026-11-21T10:00:00Z uses a ball with a radius of 0.1 m, "
     "but booth.toml says 0.2 m (calibrate.ball_radius_m): set it back if the ball is the same, or "
     "start again with station calibrate --new",

@@ -120,7 +120,10 @@ def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPa
     )
     in_cm = _run(config, "stand", "--height", "170")
     assert in_cm.exit_code == 2
-    assert "0.3<=x<=2.2" in in_cm.output
+    assert "170 is not a number 0.3<=x<=2.2, in metres" in in_cm.output
+    nobody = _run(config, "stand", "--yes")
+    assert nobody.exit_code == 2
+    assert "give --height METRES" in nobody.output
     assert len(laid) == 1
 
 

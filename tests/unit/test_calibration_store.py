@@ -216,6 +216,53 @@ def test_two_heights_of_one_hook_belong_together(tmp_path: Path, told: str, kept
     assert Session.load(tmp_path / "s").raised == kept.split()
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"time_s": float("nan")}, {"time_s": 10**400}, {"points": float("inf")}, {"radius_m": -0.1},
+        {"radius_sigma_m": float("nan")}, {"center_m": [0.0, 0.0, -2.0]},
+        {"covariance_m2": np.zeros((3, 3)).tolist()},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_detection_that_cannot_be_is_named(tmp_path: Path, wrong: dict[str, object]) -> None:
+    """Some were put into use; accuracy was less, and nothing said why."""
+    session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
+    ball = {**_ball("front-lower", 1.0).to_json(), **wrong}
+    (session.folder / JOURNAL).write_text(json.dumps({"step": MARK, "balls": [ball]}) + "\n")
+    with pytest.raises(FormatError, match="line 1 cannot be read"):
+        Session.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "step",
+    ["hanging-nan", "hanging-0", "stand-99999", "hanging--700", "standby-1500", "stand-١٨٠٠"],
+)
+def test_a_height_out_of_sight_is_named(tmp_path: Path, step: str) -> None:
+    """One was taken for a head instead of the ball."""
+    session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
+    entry = {"step": step, "balls": [_ball("front-lower", 1.0).to_json()]}
+    (session.folder / JOURNAL).write_text(json.dumps(entry) + "\n")
+    with pytest.raises(FormatError, match="line 1 cannot be read"):
+        Session.load(tmp_path)
+
+
+def test_nested_nonsense_is_named(tmp_path: Path) -> None:
+    session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
+    (session.folder / JOURNAL).write_text("[" * 100_000 + "\n")
+    with pytest.raises(FormatError, match="line 1 cannot be read"):
+        Session.load(tmp_path)
+
+
+def test_what_was_seen_is_listed(tmp_path: Path) -> None:
+    """Nobody could tell the wrong one of "3 measured heights"."""
+    session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
+    for step in ("hanging-1800", "hanging-700", "stand-1080"):
+        session.record_resting(step, [_ball("front-lower", 1.0)])
+    listed = "the ball hanging at 1.8 and 0.7 m, the ball on a stand at 1.08 m"
+    assert session.summary() == listed
+
+
 def test_advice_names_what_is_missing() -> None:
     coverage = Coverage(CAMERAS, "front-upper", 0.1)
     assert coverage.share == 0.0

@@ -28,18 +28,19 @@ def test_every_command_explains_itself(group: click.Group, name: str) -> None:
     assert "Examples:" in result.output
 
 
-@pytest.mark.parametrize("given", ["nan", "inf", "-1", "two"])
+@pytest.mark.parametrize("given", ["nan", "inf", "-1", "two", "1,5"])
 def test_a_number_is_finite_and_in_its_range(given: str) -> None:
     """A token of nan days would never expire."""
 
     @click.command()
-    @click.option("--days", type=Number(min=0.0))
+    @click.option("--days", type=Number(0.0, unit="days"))
     def command(days: float) -> None:
         click.echo(f"{days:.2f}")
 
     refused = CliRunner().invoke(command, ["--days", given])
     assert refused.exit_code == 2
-    assert given in refused.output
+    assert f"{given} is not a number x>=0.0, in days" in refused.output
+    assert ("write a point" in refused.output) == ("," in given)
     assert CliRunner().invoke(command, ["--days", "1.5"]).output == "1.50\n"
 
 

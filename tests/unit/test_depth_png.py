@@ -68,6 +68,61 @@ def test_what_cannot_be_inflated_is_torn(packed: bytes) -> None:
     assert image_of_png(_file(64, 48, packed)) is None
 
 
+_ROWS = bytes(48 * 129)
+_HEADER = struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0)
+_PACKED = zlib.compress(_ROWS)
+
+
+def _open_stream() -> bytes:
+    stream = zlib.compressobj()
+    return stream.compress(_ROWS) + stream.flush(zlib.Z_SYNC_FLUSH)
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        [(b"IDAT", _PACKED[:-4])],
+        [(b"IDAT", _open_stream())],
+        [(b"IDAT", _PACKED + b"more")],
+        [(b"IHDR", _HEADER), (b"IDAT", _PACKED)],
+        [(b"IDAT", _PACKED[:9]), (b"tEXt", b"a\0b"), (b"IDAT", _PACKED[9:])],
+        [(b"IDAT", _PACKED), (b"IEND", b"")],
+        [(b"ABCD", b""), (b"IDAT", _PACKED)],
+        [(b"acTL", bytes(8)), (b"IDAT", _PACKED)],
+        [],
+    ],
+    ids=[
+        "no checksum", "no end", "more behind", "two headers", "chunk between", "two ends",
+        "unknown", "animated", "no image",
+    ],
+)  # fmt: skip
+def test_what_no_program_writes_is_not_read(chunks: list[tuple[bytes, bytes]]) -> None:
+    """Only OpenCV refused some of these, or read another picture from them."""
+    assert image_of_png(_chunks([(b"IHDR", _HEADER), *chunks, (b"IEND", b"")])) is None
+
+
+def test_an_interlaced_image_with_a_wrong_checksum_is_torn() -> None:
+    """OpenCV reads it without a word, in other depths."""
+    header = struct.pack(">IIBBBBB", 1, 1, 16, 0, 0, 0, 1)
+    packed = bytearray(zlib.compress(b"\0\x10\x20"))
+    for wrong in (0, 1):
+        packed[-1] ^= wrong
+        content = _chunks([(b"IHDR", header), (b"IDAT", bytes(packed)), (b"IEND", b"")])
+        assert (image_of_png(content) is None) == bool(wrong)
+
+
+def test_the_shortest_files_are_no_images() -> None:
+    assert png_size(b"\x89PNG\r\n\x1a\nIENDIHDR") is None
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((2, 2), np.float32), np.zeros((0, 2), np.uint16), np.zeros(4, np.uint16)]
+)
+def test_only_depths_are_written(image: NDArray[np.uint16]) -> None:
+    with pytest.raises(ValueError, match="no image of 16-bit values"):
+        png_of(image)
+
+
 def test_eight_bits_are_left_to_who_asks() -> None:
     """A bundle refuses them; it says what it found."""
     found = image_of_png(cv2.imencode(".png", DEPTH.astype(np.uint8))[1].tobytes())
@@ -77,7 +132,10 @@ def test_eight_bits_are_left_to_who_asks() -> None:
 
 def _file(width: int, height: int, packed: bytes) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b""))
+    return _chunks([(b"IHDR", header), (b"IDAT", packed), (b"IEND", b"")])
+
+
+def _chunks(chunks: list[tuple[bytes, bytes]]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -218,3 +219,32 @@ def test_a_stored_view_comes_back(stored: StaticView, tmp_path: Path) -> None:
         StaticView.load(path)
     with pytest.raises(FormatError, match=r"nothing\.npz"):
         StaticView.load(tmp_path / "nothing.npz")
+
+
+def test_a_damaged_view_is_named(stored: StaticView, tmp_path: Path) -> None:
+    """A page of zeros in it ended a check of the cameras in a traceback."""
+    path = tmp_path / "front-lower.npz"
+    stored.save(path)
+    content = path.read_bytes()
+    for at in range(0, len(content), len(content) // 40):
+        path.write_bytes(content[:at] + bytes(4096) + content[at + 4096 :])
+        with pytest.raises(FormatError, match=r"front-lower\.npz cannot be read"):
+            StaticView.load(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": np.array(0)}, {"frames": np.array(np.inf)}, {"noise": np.full((4, 4), np.nan)},
+        {"inverse_depth": np.zeros(4)}, {"readings": np.zeros((2, 4))},
+        {"outline_noise": np.full((4, 4), "x")},
+    ],
+)  # fmt: skip
+def test_a_view_that_no_camera_has_is_named(tmp_path: Path, change: dict[str, np.ndarray]) -> None:
+    names = ("inverse_depth", "readings", "noise", "outline_noise")
+    whole = {name: np.zeros((4, 4)) for name in names}
+    path = tmp_path / "back-upper.npz"
+    content: Any = {**whole, "version": np.array(1), "frames": np.array(30), **change}
+    np.savez(path, **content)
+    with pytest.raises(FormatError, match=r"back-upper\.npz cannot be read"):
+        StaticView.load(path)

@@ -175,9 +175,11 @@ def test_a_second_height_near_the_first_is_not_taken(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     _, session, _ = guided
-    asked = _raise(guided, monkeypatch, [1.8, 1.75, 0.7])
-    assert len(asked) == 3
-    assert "1.75 m is too near to 1.8 m" in capsys.readouterr().out
+    asked = _raise(guided, monkeypatch, [180.0, 1.8, 1.75, 0.7])
+    assert len(asked) == 4
+    said = capsys.readouterr().out
+    assert "1.75 m is too near to 1.8 m" in said
+    assert "a ball at 180 m cannot be used: its height is in metres" in said
     assert session.raised == ["hanging-1800", "hanging-700"]
     assert seconds
 
@@ -196,6 +198,7 @@ def test_heights_are_shown_again_where_that_is_wanted(
     assert session.raised == ["hanging-1800", "hanging-700"]
     said = capsys.readouterr().out
     assert "this replaces what was seen before: hanging-1900, hanging-600" in said
+    assert Session.load(session.folder).raised == session.raised
     assert "now about 0.7 m above the floor, from the same hook" in said
     assert seconds
 

@@ -85,7 +85,7 @@ def places(*names: str) -> Problem:
     """A problem of which only the resting ball's places are known."""
     heights_m = {name: height for name in names if (height := raised_height_m(name)) is not None}
     resting = dict.fromkeys(names, ())
-    return cast(Problem, SimpleNamespace(resting=resting, heights_m=heights_m))
+    return cast(Problem, SimpleNamespace(resting=resting, heights_m=heights_m, bow_terms={}))
 
 
 def tracks() -> dict[str, Detections]:
@@ -99,6 +99,12 @@ def pairs(agreeing: float) -> dict[tuple[str, str], Pair]:
 
 def predicted(height_m: float, girth_m: float) -> PredictedError:
     return PredictedError(height_m, girth_m, 1e-4, 1e-3)
+
+
+def _raised_to(height_m: float) -> State:
+    """A state in which the floor is 2 m below the origin, and the ball is seen at a height."""
+    place = np.array([0.0, 2.0 - height_m - RADIUS_M, 0.0])
+    return replace(state(), places={"hanging-700": place})
 
 
 LIMITS = refusals.Limits()
@@ -146,6 +152,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
         refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
+    ),
+    "said to be 0.70 m above the floor was seen near 1.70 m: measure the height": (
+        lambda: refusals.check_heights(places("hanging-700"), _raised_to(1.7))
     ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
         refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])

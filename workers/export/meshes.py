@@ -63,8 +63,18 @@ def obj_mesh(vertices: Array, model: BodyModel, comments: Sequence[str] = ()) ->
     )
 
 
+_LARGEST = 1e15
+"""Numbers below it are exact as integers."""
+
+
 def _lines(keyword: bytes, rows: Array, decimals: int) -> bytes:
-    """A line of text for each row (n, 3): a keyword and three numbers."""
+    """A line of text for each row (n, 3): a keyword and three numbers.
+
+    Raises:
+        ValueError: a number is not finite, or has more digits than are written.
+    """
+    if not (np.abs(rows) * 10.0**decimals < _LARGEST).all():
+        raise ValueError("a vertex is not finite, or kilometres away")
     letters = np.frombuffer(keyword, np.uint8)
     return bytes(_written(letters, rows, 10**decimals, decimals))
 

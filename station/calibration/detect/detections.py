@@ -31,6 +31,8 @@ RAISED = (STAND, HANGING)
 """Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
 HEIGHTS_M: Mapping[str, tuple[float, float]] = {STAND: (1.7, 0.9), HANGING: (1.8, 0.7)}
 """Heights of the raised ball's underside that serve best, the upper one first."""
+RAISED_M = (0.3, 2.2)
+"""Heights of the raised ball that cameras of a booth see."""
 PLACES = (AROUND, *RAISED)
 """Steps of the resting ball that may be repeated elsewhere."""
 FLOOR = "floor"
@@ -47,10 +49,18 @@ _WHOLE_SIGMA_PER_M = 3.8e-5
 
 
 def raised_height_m(step: str) -> float | None:
-    """Stated height of the raised ball in a step's name, metres; None: it is not raised there."""
-    if not step.startswith(RAISED):
+    """Stated height of the raised ball in a step's name, metres; None: it is not raised there.
+
+    Raises:
+        ValueError: its name does not end with a height in millimetres, or with one out of sight.
+    """
+    kind, _, millimetres = step.partition("-")
+    if kind not in RAISED:
         return None
-    return 1e-3 * float(step.partition("-")[2])
+    known = millimetres.isascii() and millimetres.isdecimal()
+    if not known or not RAISED_M[0] <= 1e-3 * int(millimetres) <= RAISED_M[1]:
+        raise ValueError(f"{step} does not end with a height in millimetres, 300 to 2200")
+    return 1e-3 * int(millimetres)
 
 
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:
@@ -117,17 +127,22 @@ class BallDetection:
             FormatError: a field is missing or is not what it should be.
         """
         try:
-            return cls(
+            seen = cls(
                 camera=str(document["camera"]),
-                time_s=float(document["time_s"]),
-                center_m=_numbers(document["center_m"], (3,)),
-                covariance_m2=_numbers(document["covariance_m2"], (3, 3)),
+                time_s=float(finite_numbers(document["time_s"], ())),
+                center_m=finite_numbers(document["center_m"], (3,)),
+                covariance_m2=finite_numbers(document["covariance_m2"], (3, 3)),
                 points=int(document["points"]),
-                radius_m=float(document["radius_m"]),
-                radius_sigma_m=float(document["radius_sigma_m"]),
-                patches=_numbers(document["patches"], (None, 4)),
+                radius_m=float(finite_numbers(document["radius_m"], ())),
+                radius_sigma_m=float(finite_numbers(document["radius_sigma_m"], ())),
+                patches=finite_numbers(document["patches"], (None, 4)),
             )
-        except (KeyError, TypeError, ValueError) as cause:
+            if min(seen.center_m[2], seen.radius_m, seen.radius_sigma_m) <= 0.0:
+                raise ValueError("distance, radius and its standard deviation are above 0")
+            if np.linalg.eigvalsh(seen.covariance_m2)[0] <= 0.0:
+                raise ValueError("the covariance of the centre is not positive")
+            return seen
+        except (KeyError, TypeError, ValueError, ArithmeticError) as cause:
             raise FormatError(f"a ball detection cannot be read ({cause})") from None
 
 
@@ -162,12 +177,12 @@ class PlaneObservation:
                 camera=str(document["camera"]),
                 surface=str(document["surface"]),
                 points=int(document["points"]),
-                patches=_numbers(document["patches"], (None, 4)),
+                patches=finite_numbers(document["patches"], (None, 4)),
             )
             if len(seen.patches) < _FEWEST_PATCHES:
                 raise ValueError(f"{_FEWEST_PATCHES} patches are needed, not {len(seen.patches)}")
             return seen
-        except (KeyError, TypeError, ValueError) as cause:
+        except (KeyError, TypeError, ValueError, ArithmeticError) as cause:
             raise FormatError(f"a plane observation cannot be read ({cause})") from None
 
 
@@ -207,7 +222,12 @@ def _rounded(patches: Array) -> list[list[float]]:
     return [[float(f"{x:.7g}") for x in patch] for patch in patches.tolist()]
 
 
-def _numbers(values: Any, shape: tuple[int | None, ...]) -> Array:
+def finite_numbers(values: Any, shape: tuple[int | None, ...]) -> Array:
+    """An array of some shape; None in it stands for any length.
+
+    Raises:
+        ValueError: the values have another shape, or are not finite.
+    """
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != len(shape) or any(
         want not in (None, have) for want, have in zip(shape, array.shape, strict=True)

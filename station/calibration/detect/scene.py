@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,15 @@ SMOOTHING_PX = 3.0
 """The noise is measured, and edges are compared, after a Gaussian of this width."""
 _MOSTLY = 0.5
 _MIN_SHARE = 0.2
+_FEWEST_FRAMES = 2
+"""A noise cannot be told from one."""
+_IMAGES = ("inverse_depth", "readings", "noise", "outline_noise")
+"""Images of a stored view."""
+_UNREADABLE = (
+    OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, ArithmeticError,
+    MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""Errors of numpy and zipfile at damaged files: what they name in their headers may be anything."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +88,29 @@ class StaticView:
                         "run station calibrate floor"
                     )
                 frames = int(archive["frames"])
-                return cls(
-                    inverse_depth=archive["inverse_depth"],
-                    share=archive["readings"].astype(np.float32) / np.float32(frames),
-                    noise=archive["noise"].astype(np.float32),
-                    outline_noise=archive["outline_noise"].astype(np.float32),
-                    frames=frames,
-                )
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as cause:
+                if frames < _FEWEST_FRAMES:
+                    raise ValueError(f"it is of {frames} frames")
+                images = [_finite_image(archive[name]) for name in _IMAGES]
+                if len({image.shape for image in images}) > 1:
+                    raise ValueError("its images differ in size")
+                inverse, readings, noise, outline_noise = images
+                return cls(inverse, readings / np.float32(frames), noise, outline_noise, frames)
+        except _UNREADABLE as cause:
             raise FormatError(
                 f"{path} cannot be read ({cause}); run station calibrate floor"
             ) from None
+
+
+def _finite_image(values: NDArray[np.generic]) -> Image:
+    """An image (h, w) of a stored view.
+
+    Raises:
+        ValueError: it is none, or some of its values are not finite.
+    """
+    image = values.astype(np.float32)
+    if image.ndim != 2 or not np.isfinite(image).all():
+        raise ValueError(f"an image of finite values was expected, not {values.shape}")
+    return image
 
 
 def raw_inverse_depth(depth: NDArray[np.uint16], scale_m: float) -> Image:
@@ -124,7 +146,7 @@ def static_view(frames: Iterable[NDArray[np.uint16]], scale_m: float) -> StaticV
         level += images - first
         spread += np.square(images - first)
         count += 1
-    if count < 2:
+    if count < _FEWEST_FRAMES:
         raise ValueError("a static view needs at least two frames")
     variance = (spread - np.square(level) / count) / (count - 1)
     noise, outline_noise = np.sqrt(np.maximum(variance, 0.0))

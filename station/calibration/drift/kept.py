@@ -135,7 +135,7 @@ def _scans(folder: Path, names: Sequence[str], created: str, cameras: Set[str]) 
             if document.get("calibration") != created:
                 continue
             evidence = Evidence.from_json(document)
-        except (BoothError, KeyError, TypeError, ValueError) as error:
+        except (BoothError, KeyError, TypeError, ValueError, ArithmeticError) as error:
             _LOG.warning("%s is left out: %s", name, error)
             continue
         if (

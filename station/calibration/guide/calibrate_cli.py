@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from station.calibration.detect.detections import HANGING, RAISED_M, STAND
 from station.calibration.guide.operator import Guide
 from station.core.commands import Number, config_option
 from station.core.config import find_config, load_config
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
 
 
+_SIDE = Number(0.001, 1.0, unit="metres")
 _INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended, as in a shell."""
 
@@ -75,10 +77,11 @@ def _called(
     procedure = Procedure(config, store, recordings, guide)
     if kwargs.get("list_them"):
         return command(procedure, *args, **kwargs)
-    with store.locked():
-        result = command(procedure, *args, **kwargs)
-    guide.end_line()
-    return result
+    try:
+        with store.locked():
+            return command(procedure, *args, **kwargs)
+    finally:
+        guide.end_line()
 
 
 def _step(command: Callable[..., None]) -> Callable[..., Any]:
@@ -208,15 +211,15 @@ def around(procedure: Procedure) -> None:
 @click.option(
     "--height",
     "height_m",
-    type=Number(0.3, 2.2),
-    required=True,
-    help="of the ball's underside above the floor, metres, measured to 1 mm",
+    type=Number(*RAISED_M, unit="metres"),
+    help="of the ball's underside above the floor, metres, measured to 1 mm; without it, you are "
+    "asked, and what is seen replaces all heights before",
 )
 @click.option(
     "--hanging", is_flag=True, help="the ball hangs on a string, from the same hook at each height"
 )
 @_step
-def stand(procedure: Procedure, height_m: float, hanging: bool) -> None:
+def stand(procedure: Procedure, height_m: float | None, hanging: bool) -> None:
     """Look at the ball at a measured height above the mark: the scale of all heights.
 
     One as high as a head makes heights accurate; a lower one shows whether it was measured
@@ -225,14 +228,18 @@ def stand(procedure: Procedure, height_m: float, hanging: bool) -> None:
 
     \b
     Examples:
+      station calibrate stand
       station calibrate stand --height 0.9
       station calibrate stand --height 1.7
       station calibrate stand --height 1.8 --hanging
       station calibrate stand --height 0.7 --hanging
     """
-    from station.calibration.detect.detections import HANGING, STAND
-
-    procedure.raise_ball(height_m, HANGING if hanging else STAND)
+    if height_m is not None:
+        procedure.raise_ball(height_m, HANGING if hanging else STAND)
+    elif procedure.guide.attended or procedure.recordings is not None:
+        procedure.raised(again=True)
+    else:
+        raise click.UsageError("nobody is asked with --yes: give --height METRES")
 
 
 @calibrate.command("depth")
@@ -267,8 +274,12 @@ def solve_again(procedure: Procedure) -> None:
     help="infrared images: DIR/<camera>/<moment>.png",
 )
 @click.option("--squares", default="7x5", show_default=True, help="across x down")
-@click.option("--square", "square_m", default=0.06, show_default=True, help="side, metres")
-@click.option("--marker", "marker_m", default=0.045, show_default=True, help="side, metres")
+@click.option(
+    "--square", "square_m", type=_SIDE, default=0.06, show_default=True, help="side, metres"
+)
+@click.option(
+    "--marker", "marker_m", type=_SIDE, default=0.045, show_default=True, help="side, metres"
+)
 @click.option("--dictionary", default="DICT_4X4_100", show_default=True)
 @_options
 def board(

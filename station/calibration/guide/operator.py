@@ -14,8 +14,7 @@ _BELL = "\a"
 _LAST_SECONDS = 3
 _LINE_EVERY_S = 5.0
 _WIDTH = 100
-_HEIGHT = Number(0.0, 2.2)
-"""Metres: within sight of a booth's cameras."""
+_HEIGHT = Number(0.0, unit="metres")
 
 
 @dataclass(slots=True)
@@ -97,7 +96,7 @@ class Guide:
         self.end_line()
         if not self.attended:
             return None
-        answer = click.prompt(f"  {question} Metres (0: leave out)", type=_HEIGHT, default=0.0)
+        answer = click.prompt(f"  {question} Metres (0: leave out)", type=_HEIGHT)
         return float(answer) or None
 
     def end_line(self) -> None:

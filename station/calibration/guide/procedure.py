@@ -18,6 +18,7 @@ from station.calibration.detect.detections import (
     MARK,
     PLACES,
     RAISED,
+    RAISED_M,
     STAND,
     WALL,
 )
@@ -43,8 +44,6 @@ _SURE_OF_RADIUS = 60
 """Sightings from which on a ball of another radius is told."""
 _BOARDS = 3
 """Places of the board that a calibration asks for; a fourth buys next to nothing."""
-_RAISED_M = (0.3, 2.2)
-"""Heights of the ball that cameras of a booth see."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
 """Places of the ball: three that are not on one line show the floor's slope both ways."""
 _HOOK = (
@@ -207,15 +206,18 @@ class Procedure:
     def raised(self, *, again: bool = False) -> None:
         """The ball at two measured heights that the operator gives; at all that are recorded.
 
-        ``again``: also where it was seen at two heights already.
+        ``again``: instead of those at which it was seen before.
         """
         if self.recordings is not None:
             self._raised_in(self.recordings)
             return
         session = self._session_to_add_to()
-        seen = {kind: list(session.raised_as(kind).values()) if session else [] for kind in RAISED}
+        seen = {
+            kind: list(session.raised_as(kind).values()) if session and not again else []
+            for kind in RAISED
+        }
         complete = any(len(own) >= len(HEIGHTS_M[kind]) for kind, own in seen.items())
-        if (complete and not again) or not self.guide.attended:
+        if complete or not self.guide.attended:
             return
         self.guide.title("Ball at two heights")
         begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
@@ -228,7 +230,7 @@ class Procedure:
             height_m = self._measured_m(kind, about_m, others_m)
             if height_m is None:
                 return
-            self.raise_ball(height_m, kind, ready=True)
+            self.raise_ball(height_m, kind, ready=True, again=again and not others_m)
             others_m.append(height_m)
 
     def _raised_in(self, recordings: Path) -> None:
@@ -268,28 +270,31 @@ class Procedure:
             )
         while (height_m := self.guide.height_m(f"{where} How high is its underside?")) is not None:
             near_m = [other for other in others_m if abs(other - height_m) < _APART_M]
-            if not near_m:
+            if near_m:
+                self.guide.say(
+                    f"{height_m:g} m is too near to {near_m[0]:g} m, at which it was seen already: "
+                    f"change its height by {_APART_M:g} m or more"
+                )
+            elif not RAISED_M[0] <= height_m <= RAISED_M[1]:
+                self.guide.say(_out_of_sight(height_m))
+            else:
                 break
-            self.guide.say(
-                f"{height_m:g} m is too near to {near_m[0]:g} m, at which it was seen already: "
-                f"change its height by {_APART_M:g} m or more"
-            )
         return height_m
 
-    def raise_ball(self, height_m: float, kind: str, *, ready: bool = False) -> None:
+    def raise_ball(
+        self, height_m: float, kind: str, *, ready: bool = False, again: bool = False
+    ) -> None:
         """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
         the floor.
 
-        ``ready``: it is there already.
+        ``ready``: it is there already; ``again``: instead of all heights before.
         """
-        if not _RAISED_M[0] <= height_m <= _RAISED_M[1]:
-            raise CalibrationError(
-                f"a ball at {height_m:g} m cannot be used: its height is in metres, 0.3 to 2.2"
-            )
+        if not RAISED_M[0] <= height_m <= RAISED_M[1]:
+            raise CalibrationError(_out_of_sight(height_m))
         step = f"{kind}-{round(1e3 * height_m)}"
         if ready:
             self.guide.count_down()
-            self._see_at_rest(step)
+            self._see_at_rest(step, again=again)
         else:
             if kind == HANGING:
                 where = f"hanging above the mark, its underside {height_m:g} m above the floor"
@@ -387,10 +392,12 @@ class Procedure:
         self.guide.step(title, instruction, lays=True)
         self._see_at_rest(step)
 
-    def _see_at_rest(self, step: str) -> None:
+    def _see_at_rest(self, step: str, *, again: bool = False) -> None:
         with self._feed(step) as (feed, session):
             self._remark_on_ghosts(session)
             before = session.raised
+            if again and before:
+                session.forget_raised()
             rest_ball(feed, session, self.guide, step)
             self._say_what_is_left(session, step, before)
 
@@ -409,9 +416,12 @@ class Procedure:
         elif (self.recordings / step).is_dir():
             source = replayed_feed(self.config, self.recordings / step)
         else:
-            known = ", ".join(sorted(path.name for path in self.recordings.iterdir()))
+            inside = sorted(self.recordings.iterdir())
+            known = ", ".join(path.name for path in inside) or "nothing"
+            deeper = [path for path in inside if (path / step).is_dir()]
+            hint = f" ({deeper[0]} does)" if deeper else ""
             raise CalibrationError(
-                f"{self.recordings} holds no recording of the step {step}; it holds {known}"
+                f"{self.recordings} holds no recording of the step {step}; it holds {known}{hint}"
             )
         with source as feed:
             cameras = feed.cameras(_SENSORS_S)
@@ -432,6 +442,13 @@ class Procedure:
                     "moved since, begin anew: station calibrate --new"
                 )
             yield feed, session
+
+
+def _out_of_sight(height_m: float) -> str:
+    return (
+        f"a ball at {height_m:g} m cannot be used: its height is in metres, {RAISED_M[0]:g} to "
+        f"{RAISED_M[1]:g}"
+    )
 
 
 def _now() -> str:

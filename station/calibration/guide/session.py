@@ -26,10 +26,12 @@ from station.calibration.detect.detections import (
     MARK,
     PLACES,
     RAISED,
+    STAND,
     WALL,
     BallDetection,
     Observations,
     PlaneObservation,
+    finite_numbers,
     raised_height_m,
 )
 from station.calibration.detect.scene import StaticView
@@ -48,6 +50,11 @@ _SAME_HEIGHT_M = 0.15
 """Heights of the ball that are nearer to each other are a measurement and its correction."""
 _HOOK_HEIGHTS = 2
 """Heights at which the ball hangs from one hook."""
+_FORGET_RAISED = "forget-raised"
+_NO_ENTRY = (
+    ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
+)  # fmt: skip
+"""Errors that a line makes which no station wrote."""
 _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
@@ -114,8 +121,11 @@ class Session:
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         sensors = Rig.load(folder / SENSORS)
         try:
-            started, radius_m = str(document["started"]), float(document["radius_m"])
-        except (KeyError, TypeError, ValueError) as cause:
+            started = str(document["started"])
+            radius_m = float(finite_numbers(document["radius_m"], ()))
+            if radius_m <= 0.0:
+                raise ValueError(f"radius {radius_m:g}")
+        except (KeyError, TypeError, ValueError, ArithmeticError) as cause:
             raise FormatError(
                 f"{path} cannot be used ({cause}); start again with station calibrate --new"
             ) from None
@@ -189,8 +199,13 @@ class Session:
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
             f"{self.around_count} places around it": bool(self.around_count),
-            f"{len(self.raised)} measured heights of the ball": bool(self.raised),
-            f"{self.wall_count} boards": self.done(WALL),
+            f"the ball hanging at {_listed(self.raised_as(HANGING))} m": bool(
+                self.raised_as(HANGING)
+            ),
+            f"the ball on a stand at {_listed(self.raised_as(STAND))} m": bool(
+                self.raised_as(STAND)
+            ),
+            f"the board at {self.wall_count} of its places": self.done(WALL),
         }
         return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
 
@@ -251,6 +266,10 @@ class Session:
         """Wave from the beginning: another radius, a ball that slipped."""
         self._append({"step": "forget-balls"})
 
+    def forget_raised(self) -> None:
+        """Show the ball at its heights anew: one was measured wrongly."""
+        self._append({"step": _FORGET_RAISED})
+
     def record_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
         """Intrinsics that the board constrains better than the factory's; None: the factory's."""
         document = {
@@ -284,7 +303,7 @@ class Session:
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
                 self._take(json.loads(line))
-            except (ValueError, KeyError, TypeError, AttributeError, FormatError) as cause:
+            except _NO_ENTRY as cause:
                 raise FormatError(
                     f"{path}: line {number} cannot be read ({cause}); start again with "
                     "station calibrate --new"
@@ -297,13 +316,16 @@ class Session:
             self._later_s = None
         elif step == "forget-balls":
             self.balls.clear()
+        elif step == _FORGET_RAISED:
+            for place in self.raised:
+                del self.around[place]
         elif step == BALL:
             seen = self._balls(entry)
             later_s = self._moved_by(min(ball.time_s for ball in seen))
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
-        elif step.startswith(PLACES):
+        elif step.partition("-")[0] in PLACES:
             for other in self._replaced_by(step):
                 del self.around[other]
             self.around[step] = self._balls(entry)
@@ -311,7 +333,10 @@ class Session:
             for name, lens in entry["lenses"].items():
                 self.lenses.pop(str(name), None)
                 if lens is not None:
-                    self.lenses[str(name)] = Lens(lens["K"], lens["distortion"])
+                    self.lenses[str(name)] = Lens(
+                        finite_numbers(lens["K"], (3, 3)).tolist(),
+                        finite_numbers(lens["distortion"], (None,)).tolist(),
+                    )
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
@@ -347,3 +372,7 @@ class Session:
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
         return self._later_s
+
+
+def _listed(heights_m: Mapping[str, float]) -> str:
+    return " and ".join(f"{height_m:g}" for height_m in heights_m.values())

@@ -2,7 +2,8 @@
 
 A standing body is replaced by rings of points about the mark. A camera that sees a point at the
 depth z with the ray d reports X = T d z; its change by the pose's twist and the sensor's parameters
-gives one row per point, and a girth is the mean of its ring's rows times 2 pi.
+gives one row per point. A tilted world moves the whole body, which spoils no shape: rigid motions
+are left out of all rings together. A girth is then the mean of its ring's rows times 2 pi.
 """
 
 from __future__ import annotations
@@ -57,16 +58,17 @@ def predict_errors(
     def sigma(row: Array) -> float:
         return float(np.sqrt(max(float(row @ state.covariance @ row), 0.0)))
 
-    every, girths, rigid = [], [], []
+    every, rigid, ring_of = [], [], []
     for height_m in (*_LEGS_M, *_RINGS_M.values()):
         points, normals = _ring(height_m)
         rows, covered = seen(points, normals)
         every.append(rows)
         rigid.append(np.concatenate([np.cross(points, normals), normals], axis=1)[covered])
-        if height_m in _RINGS_M.values():
-            girths.append(sigma(2.0 * np.pi * rows.mean(axis=0)))
+        ring_of += [height_m] * len(rows)
     crown = seen(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0][0]
     whole = _not_rigid(np.concatenate(every), np.concatenate(rigid))
+    rings = [whole[np.array(ring_of) == height_m] for height_m in _RINGS_M.values()]
+    girths = [sigma(2.0 * np.pi * rows.mean(axis=0)) for rows in rings]
     variance = np.einsum("ni,ij,nj->n", whole, state.covariance, whole, optimize=True)
     return PredictedError(
         height_sigma_m=sigma(crown),

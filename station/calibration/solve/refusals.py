@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.contacts import PLUMB
+from station.calibration.adjust.contacts import PLUMB, contact_error_m
 from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
@@ -18,7 +18,6 @@ from station.calibration.detect.detections import (
     HANGING,
     HEIGHTS_M,
     MARK,
-    STAND,
     BallDetection,
     Observations,
 )
@@ -49,6 +48,8 @@ _ONE_PLACE_OFF_M = 0.006
 _FRONT_M = 0.2
 """Least distance of the ball in front of the mark from it."""
 _MARK_TOLERANCE_M = 0.008
+_HEIGHT_TOLERANCE_M = 0.2
+"""Largest error of a stated height before anything is solved, with poses good to centimetres."""
 _SURELY_WRONG = 0.5
 """Probability from which on something is wrong of what people said of the resting ball."""
 _LARGEST_SLOPE_RAD = np.radians(0.15)
@@ -56,8 +57,8 @@ _LARGEST_SLOPE_RAD = np.radians(0.15)
 SIGMAS_95 = 1.96
 _START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = (
-    "put the ball on a stand of measured height (station calibrate stand --height "
-    f"{HEIGHTS_M[STAND][0]:g})"
+    "hang the ball above the mark, or put it on a stand, at measured heights (station calibrate "
+    "stand)"
 )
 HANGING_WORDS = (
     "hang the ball from one and the same hook at two heights, and let it come to rest (station "
@@ -252,6 +253,18 @@ def check_slope(problem: Problem, world_poses: WorldPoses) -> None:
         )
 
 
+def check_heights(problem: Problem, start: State) -> None:
+    """Refuse heights that are decimetres off: two that were exchanged would be another radius."""
+    for place, height_m in problem.heights_m.items():
+        off_m = contact_error_m(problem, start, place)
+        if abs(off_m) > _HEIGHT_TOLERANCE_M:
+            raise CalibrationError(
+                f"the ball that was said to be {height_m:.2f} m above the floor was seen near "
+                f"{height_m + off_m:.2f} m: measure the height of its underside above the floor "
+                "again, and show the ball at its heights anew (station calibrate stand)"
+            )
+
+
 def check_doubts(problem: Problem, state: State) -> None:
     """Refuse a ball that was not where it was said to be: at a height, plumb, on the floor.
 
@@ -262,13 +275,11 @@ def check_doubts(problem: Problem, state: State) -> None:
     worst = state.doubts[0]
     if worst.places[0] in problem.heights_m:
         heights = ", ".join(f"{problem.heights_m[place]:.3f}" for place in worst.places)
-        hung = any(place.startswith(HANGING) for place in worst.places)
-        again = HANGING_WORDS if hung else "repeat that step (station calibrate stand --height ...)"
         raise CalibrationError(
             f"the ball at the height of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
             f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
-            f"the floor again, and {again}; if it was right, let the sensors warm up and wave the "
-            "ball again"
+            "the floor again, and show the ball at its heights anew (station calibrate stand); if "
+            "it was right, let the sensors warm up and wave the ball again"
         )
     if worst.places == (PLUMB,):
         raise CalibrationError(

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from station.calibration.adjust.averaging import averaged_state, most_probable_widths
 from station.calibration.adjust.ball_shape import SHAPE
+from station.calibration.adjust.contacts import plumb_ends
 from station.calibration.adjust.joint import solve_joint
 from station.calibration.adjust.problem import ROUND, SHAPE_KNOT_S, Problem, Sightings, State
 from station.calibration.adjust.sensor_model import COARSE, SensorModel
@@ -24,6 +25,7 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import (
     FLOOR,
     FRONT,
+    HANGING,
     MARK,
     WALL,
     Observations,
@@ -170,6 +172,7 @@ def solve(
         refusals.check_connected(cameras, poses)
 
         problem = _problem(observations, cameras, seen, poses, radius_m, reference)
+        refusals.check_heights(problem, first_state(problem, poses))
         progress("solving, with a fifth of the seconds kept for the test")
         training, tested, found = _tested(problem, poses)
 
@@ -220,6 +223,8 @@ def _advice(
         weak.append(f"for heights, {refusals.remedy(stood, refusals.STAND_WORDS)}")
     elif not stood:
         weak.append(f"for heights, {refusals.STAND_WORDS}")
+    if any(at.startswith(HANGING) for at in problem.heights_m) and plumb_ends(problem) is None:
+        weak.append(f"to know what is vertical, {refusals.HANGING_WORDS}")
     if not _boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")
     if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:

@@ -6,15 +6,29 @@ from pathlib import Path
 
 import click
 
+_COUNT, _SEED = click.IntRange(1), click.IntRange(0)
+
 
 @click.command()
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
 )
-@click.option("--seed", default=0, show_default=True, help="the same seed learns the same model")
-@click.option("--bodies", default=1600, show_default=True, help="training bodies")
-@click.option("--poses", default=1000, show_default=True, help="training poses")
-@click.option("--components", default=160, show_default=True, help="shape components kept")
+@click.option(
+    "--seed",
+    type=_SEED,
+    default=0,
+    show_default=True,
+    help="the same seed learns the same model",
+)
+@click.option("--bodies", type=_COUNT, default=1600, show_default=True, help="training bodies")
+@click.option("--poses", type=_COUNT, default=1000, show_default=True, help="training poses")
+@click.option(
+    "--components",
+    type=_COUNT,
+    default=160,
+    show_default=True,
+    help="shape components kept",
+)
 def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> None:
     """Build the database and learn the body model (minutes; needs the train extra).
 
@@ -35,8 +49,8 @@ def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> Non
 
 @click.command()
 @click.option("--model", type=click.Path(path_type=Path), help="the shipped one if absent")
-@click.option("--bodies", default=100, show_default=True, help="held-out bodies")
-@click.option("--seed", default=0, show_default=True)
+@click.option("--bodies", type=_COUNT, default=100, show_default=True, help="held-out bodies")
+@click.option("--seed", type=_SEED, default=0, show_default=True)
 @click.option(
     "--pictures",
     type=click.Path(path_type=Path),
@@ -69,8 +83,14 @@ def evaluate_model(
 
 
 @click.command()
-@click.option("--bodies", default=400, show_default=True, help="bodies to make and to measure")
-@click.option("--seed", default=0, show_default=True)
+@click.option(
+    "--bodies",
+    type=_COUNT,
+    default=400,
+    show_default=True,
+    help="bodies to make and to measure",
+)
+@click.option("--seed", type=_SEED, default=0, show_default=True)
 def population(bodies: int, seed: int) -> None:
     """Compare the training bodies with people, size by size (needs the train extra).
 
