@@ -199,8 +199,19 @@ def test_heights_are_shown_again_where_that_is_wanted(
     said = capsys.readouterr().out
     assert "this replaces what was seen before: hanging-1900, hanging-600" in said
     assert Session.load(session.folder).raised == session.raised
-    assert "now about 0.7 m above the floor, from the same hook" in said
     assert seconds
+
+
+def test_a_single_step_names_the_height_that_is_missing(
+    guided: tuple[Procedure, Session, list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A calibration without it was used, and nothing said that the vertical was unknown."""
+    begun, _, _ = guided
+    unattended = replace(begun, guide=replace(begun.guide, attended=False))
+    for height_m, missing in ((0.75, "1.8 m"), (1.8, "")):
+        unattended.raise_ball(height_m, "hanging")
+        said = capsys.readouterr().out
+        assert (f"now about {missing} above the floor, from the same hook" in said) == bool(missing)
 
 
 @pytest.mark.parametrize(

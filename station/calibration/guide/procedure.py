@@ -303,14 +303,14 @@ class Procedure:
                 where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
                 instruction = "Put it up and step back."
             self._lay(step, f"Ball {where}", instruction)
+            if kind == HANGING and self.recordings is None:
+                self._ask_for_the_other()
 
-    def _say_what_is_left(self, session: Session, step: str, before: Sequence[str]) -> None:
-        """Name the heights of the ball that were replaced, and the one that is missing."""
-        gone = [place for place in before if place not in session.raised]
-        if gone:
-            self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
-        own_m = list(session.raised_as(HANGING).values())
-        if step.startswith(HANGING) and len(own_m) == 1 and self.recordings is None:
+    def _ask_for_the_other(self) -> None:
+        """Name the height that is missing, if the ball hung at one only."""
+        session = self._session_to_add_to()
+        own_m = list(session.raised_as(HANGING).values()) if session else []
+        if len(own_m) == 1:
             upper_m, lower_m = HEIGHTS_M[HANGING]
             other_m = lower_m if own_m[0] > 0.5 * (upper_m + lower_m) else upper_m
             self.guide.say(
@@ -399,7 +399,9 @@ class Procedure:
             if again and before:
                 session.forget_raised()
             rest_ball(feed, session, self.guide, step)
-            self._say_what_is_left(session, step, before)
+            gone = [place for place in before if place not in session.raised]
+            if gone:
+                self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
 
     def _remark_on_ghosts(self, session: Session) -> None:
         if not session.done(EMPTY):

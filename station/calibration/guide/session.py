@@ -23,6 +23,7 @@ from station.calibration.detect.detections import (
     EMPTY,
     FRONT,
     HANGING,
+    HEIGHTS_M,
     MARK,
     PLACES,
     RAISED,
@@ -48,8 +49,6 @@ Seen = TypeVar("Seen", BallDetection, PlaneObservation)
 
 _SAME_HEIGHT_M = 0.15
 """Heights of the ball that are nearer to each other are a measurement and its correction."""
-_HOOK_HEIGHTS = 2
-"""Heights at which the ball hangs from one hook."""
 _FORGET_RAISED = "forget-raised"
 _NO_ENTRY = (
     ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
@@ -348,7 +347,7 @@ class Session:
         if height_m is None:
             return []
         own = self.raised_as(step.partition("-")[0])
-        if step.startswith(HANGING) and len(own) == _HOOK_HEIGHTS:
+        if step.startswith(HANGING) and len(own) == len(HEIGHTS_M[HANGING]):
             return list(own)
         return [other for other, its_m in own.items() if abs(its_m - height_m) < _SAME_HEIGHT_M]
 
