@@ -327,6 +327,15 @@ def test_a_stand_that_was_measured_wrongly_is_refused(
         solved(procedure.booth.rig, replace(seen, around=around))
 
 
+def test_two_heights_that_were_exchanged_are_told_as_such(
+    procedure: VirtualProcedure, seen: Observations
+) -> None:
+    """The ball was said to measure 85 mm instead of 100."""
+    stands = {"stand-900": seen.around["stand-1700"], "stand-1700": seen.around["stand-900"]}
+    with pytest.raises(CalibrationError, match=r"said to be .* was seen near"):
+        solved(procedure.booth.rig, replace(seen, around={**seen.around, **stands}))
+
+
 class _MovedHook(VirtualProcedure):
     """The hook moved by 20 mm between the two heights at which the ball hung."""
 
