@@ -126,6 +126,7 @@ def procedure_seconds(*, extras: bool, hangs: bool = False) -> dict[str, float]:
     session = SimpleNamespace(
         done=lambda step: step == EMPTY,
         around_count=0,
+        balls=(),
         raised=[],
         raised_as=lambda _: {},
         wall_count=0,

@@ -214,6 +214,27 @@ def test_a_single_step_names_the_height_that_is_missing(
         assert (f"now about {missing} above the floor, from the same hook" in said) == bool(missing)
 
 
+def test_a_height_that_is_decimetres_off_is_asked_for_again(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It was told with the solution, when the ball had been taken down."""
+    _, session, looked = guided
+
+    def wrong(_: Procedure, step: str) -> str | None:
+        return "seen near 1.8 m" if step == "hanging-1080" else None
+
+    monkeypatch.setattr(Procedure, "_wrong_height", wrong)
+    asked = _raise(guided, monkeypatch, [1.08, 1.8, 0.7])
+    assert asked[0] == asked[1]
+    assert looked == ["hanging-1080", "hanging-1800", "hanging-700"]
+    assert Session.load(session.folder).raised == ["hanging-1800", "hanging-700"]
+    assert "seen near 1.8 m" in capsys.readouterr().out
+    assert seconds
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [

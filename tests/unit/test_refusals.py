@@ -107,6 +107,11 @@ def _raised_to(height_m: float) -> State:
     return replace(state(), places={"hanging-700": place})
 
 
+def _told(words: str | None) -> None:
+    if words is not None:
+        raise CalibrationError(words)
+
+
 LIMITS = refusals.Limits()
 REFUSED: dict[str, Callable[[], object]] = {
     "has not been waved yet: station calibrate ball": partial(refusals.check_counts, coverage(0)),
@@ -154,7 +159,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
     "said to be 0.70 m above the floor was seen near 1.70 m: measure the height": (
-        lambda: refusals.check_heights(places("hanging-700"), _raised_to(1.7))
+        lambda: _told(refusals.wrong_height(places("hanging-700"), _raised_to(1.7)))
     ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
         refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -226,12 +226,17 @@ class Procedure:
         best_m = list(HEIGHTS_M[kind])
         if begun:
             best_m = [max(best_m, key=lambda height_m: abs(height_m - others_m[0]))]
-        for about_m in best_m:
-            height_m = self._measured_m(kind, about_m, others_m)
+        while best_m:
+            height_m = self._measured_m(kind, best_m[0], others_m)
             if height_m is None:
                 return
-            self.raise_ball(height_m, kind, ready=True, again=again and not others_m)
+            step = self.raise_ball(height_m, kind, ready=True, again=again and not others_m)
+            if words := self._wrong_height(step):
+                self.guide.say(words)
+                self.session().forget_raised([step])
+                continue
             others_m.append(height_m)
+            best_m.pop(0)
 
     def _raised_in(self, recordings: Path) -> None:
         """The ball at all heights that are recorded."""
@@ -283,9 +288,9 @@ class Procedure:
 
     def raise_ball(
         self, height_m: float, kind: str, *, ready: bool = False, again: bool = False
-    ) -> None:
+    ) -> str:
         """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
-        the floor.
+        the floor; the step's name.
 
         ``ready``: it is there already; ``again``: instead of all heights before.
         """
@@ -303,8 +308,28 @@ class Procedure:
                 where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
                 instruction = "Put it up and step back."
             self._lay(step, f"Ball {where}", instruction)
-            if kind == HANGING and self.recordings is None:
+            if words := self._wrong_height(step):
+                self.guide.say(words)
+            elif kind == HANGING and self.recordings is None:
                 self._ask_for_the_other()
+        return step
+
+    def _wrong_height(self, step: str) -> str | None:
+        """Words on a height that is decimetres from where the cameras, found so far, see the ball.
+
+        It is known while the ball is still there, and not only with the solution.
+        """
+        from station.calibration.solve.solution import wrong_height
+
+        session = self._session_to_add_to()
+        if session is None or not session.balls:
+            return None
+        others = set(session.raised) - {step}
+        around = {place: balls for place, balls in session.around.items() if place not in others}
+        return wrong_height(
+            replace(session.observations(), around=around), session.lensed_cameras(),
+            radius_m=session.radius_m, reference=self.config.reference,
+        )  # fmt: skip
 
     def _ask_for_the_other(self) -> None:
         """Name the height that is missing, if the ball hung at one only."""
@@ -397,7 +422,7 @@ class Procedure:
             self._remark_on_ghosts(session)
             before = session.raised
             if again and before:
-                session.forget_raised()
+                session.forget_raised(before)
             rest_ball(feed, session, self.guide, step)
             gone = [place for place in before if place not in session.raised]
             if gone:

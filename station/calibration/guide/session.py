@@ -265,9 +265,9 @@ class Session:
         """Wave from the beginning: another radius, a ball that slipped."""
         self._append({"step": "forget-balls"})
 
-    def forget_raised(self) -> None:
-        """Show the ball at its heights anew: one was measured wrongly."""
-        self._append({"step": _FORGET_RAISED})
+    def forget_raised(self, places: Sequence[str]) -> None:
+        """Forget the ball at some heights, which were measured wrongly."""
+        self._append({"step": _FORGET_RAISED, "places": list(places)})
 
     def record_lenses(self, lenses: Mapping[str, Lens | None]) -> None:
         """Intrinsics that the board constrains better than the factory's; None: the factory's."""
@@ -316,8 +316,8 @@ class Session:
         elif step == "forget-balls":
             self.balls.clear()
         elif step == _FORGET_RAISED:
-            for place in self.raised:
-                del self.around[place]
+            for place in entry["places"]:
+                self.around.pop(str(place), None)
         elif step == BALL:
             seen = self._balls(entry)
             later_s = self._moved_by(min(ball.time_s for ball in seen))

@@ -253,21 +253,22 @@ def check_slope(problem: Problem, world_poses: WorldPoses) -> None:
         )
 
 
-def check_heights(problem: Problem, start: State) -> None:
-    """Refuse heights that are decimetres off: two that were exchanged would be another radius."""
+def wrong_height(problem: Problem, start: State) -> str | None:
+    """Words on a height that is decimetres off: two that were exchanged would be another radius."""
     offs_m = {place: contact_error_m(problem, start, place) for place in problem.resting}
     laid = [abs(off_m) for place, off_m in offs_m.items() if place not in problem.heights_m]
     if max(laid, default=0.0) > 0.5 * _HEIGHT_TOLERANCE_M:
         # Something else was taken for the ball on the floor: the solution shows what.
-        return
+        return None
     for place, height_m in problem.heights_m.items():
         off_m = offs_m[place]
         if abs(off_m) > _HEIGHT_TOLERANCE_M:
-            raise CalibrationError(
+            return (
                 f"the ball that was said to be {height_m:.2f} m above the floor was seen near "
                 f"{height_m + off_m:.2f} m: measure the height of its underside above the floor "
                 "again, and show the ball at its heights anew (station calibrate stand)"
             )
+    return None
 
 
 def check_doubts(problem: Problem, state: State) -> None:

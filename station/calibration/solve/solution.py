@@ -172,7 +172,8 @@ def solve(
         refusals.check_connected(cameras, poses)
 
         problem = _problem(observations, cameras, seen, poses, radius_m, reference)
-        refusals.check_heights(problem, first_state(problem, poses))
+        if words := refusals.wrong_height(problem, first_state(problem, poses)):
+            raise CalibrationError(words)
         progress("solving, with a fifth of the seconds kept for the test")
         training, tested, found = _tested(problem, poses)
 
@@ -193,6 +194,27 @@ def solve(
         rig = replace(rig, predicted=predicted)
         weak = _advice(problem, predicted, world_poses, limits, coverage)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
+
+
+def wrong_height(
+    observations: Observations,
+    cameras: Mapping[str, CameraCalibration],
+    *,
+    radius_m: float,
+    reference: str,
+) -> str | None:
+    """Words on a raised ball that was seen decimetres from the height that was told; None where all
+    are right, or too little was seen so far to know."""
+    try:
+        balls = without_gaps(observations.balls)
+        seen = sorted_detections(balls, list(cameras), radius_m, held=False)
+        pairs = estimate_pairs({name: own.track for name, own in seen.items()})
+        poses = chain_poses(pairs, reference, list(cameras))
+        refusals.check_connected(cameras, poses)
+        problem = _problem(observations, cameras, seen, poses, radius_m, reference)
+    except CalibrationError:
+        return None
+    return refusals.wrong_height(problem, first_state(problem, poses))
 
 
 def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem, State]:
