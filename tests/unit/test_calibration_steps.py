@@ -139,15 +139,15 @@ def test_a_hanging_ball_that_is_lost_now_and_then_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the edge of an image: 60 detections without a gap were asked for."""
-    kept = _hung(tmp_path, monkeypatch, lasts_s=5.0, swing_m=1e-3, every=2)
+    kept = _hung(tmp_path, monkeypatch, lasts_s=3.5, swing_m=1e-3, every=2)
     assert {ball.camera for ball in kept} == set(_CAMERAS)
 
 
-@pytest.mark.parametrize(("lasts_s", "swing_m"), [(3.5, 1e-3), (6.0, 0.05)], ids=["short", "swing"])
+@pytest.mark.parametrize(("lasts_s", "swing_m"), [(2.0, 1e-3), (6.0, 0.05)], ids=["short", "swing"])
 def test_a_ball_that_hangs_too_shortly_or_swings_is_not_at_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_s: float, swing_m: float
 ) -> None:
-    with pytest.raises(CalibrationError, match="no camera sees the ball at rest for 4 s"):
+    with pytest.raises(CalibrationError, match=r"no camera sees the ball at rest for 2\.5 s"):
         _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m)
 
 

@@ -25,7 +25,10 @@ _WALL_FRAMES = 30
 _RESTING_S = 60.0
 _RESTING_DETECTIONS = 12
 _HANGING_DETECTIONS = 24
-"""In ``LOOK_S``: a camera that loses the ball in some frames still sees where it hangs."""
+"""Fewest detections of a hanging ball: a camera that loses it in some frames still sees where it
+hangs."""
+_SHORTEST_S = 2.5
+"""Least time for which a recording shows the hanging ball: most of a swing."""
 _RESTING_M = 0.006
 """A ball that lies still is seen in one place within the noise of a single view."""
 _OTHERS_S = 3.0
@@ -129,16 +132,17 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
             finder.submit(feed.newest())
             for ball in finder.found():
                 recent[ball.camera].append(ball)
-            still = _at_rest(recent, hangs=hangs)
+            still = _at_rest(recent, LOOK_S if hangs else None)
             guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
             now_s = time.monotonic()
             if still:
                 settled_s = min(settled_s, now_s + _OTHERS_S)
         for ball in finder.found(wait=True):
             recent[ball.camera].append(ball)
-    still = _at_rest(recent, hangs=hangs)
+    least_s = _SHORTEST_S if feed.replays else LOOK_S
+    still = _at_rest(recent, least_s if hangs else None)
     if not still:
-        seen_s = f" for {LOOK_S:g} s" if hangs else ""
+        seen_s = f" for {least_s:g} s" if hangs else ""
         raise CalibrationError(
             f"no camera sees the ball at rest{seen_s}: put it where a camera sees it (one on the "
             "floor is seen by lower cameras), take your hands away, wait until it hangs still if "
@@ -150,18 +154,19 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
 
 
 def _at_rest(
-    recent: dict[str, list[BallDetection]], *, hangs: bool
+    recent: dict[str, list[BallDetection]], hangs_s: float | None
 ) -> dict[str, list[BallDetection]]:
-    """The detections to keep of each camera that sees the ball at rest."""
-    kept = {name: _last(seen, hangs=hangs) for name, seen in recent.items()}
+    """The detections to keep of each camera that sees the ball at rest; ``hangs_s``: it hangs, and
+    has to be seen for so long."""
+    kept = {name: _last(seen, hangs_s) for name, seen in recent.items()}
     return {name: seen for name, seen in kept.items() if seen and _is_still(seen)}
 
 
-def _last(seen: list[BallDetection], *, hangs: bool) -> list[BallDetection]:
+def _last(seen: list[BallDetection], hangs_s: float | None) -> list[BallDetection]:
     """The last detections of one camera: enough of them, or none."""
-    if not hangs:
+    if hangs_s is None:
         return seen[-_RESTING_DETECTIONS:] if len(seen) >= _RESTING_DETECTIONS else []
-    if not seen or seen[-1].time_s - seen[0].time_s < LOOK_S:
+    if not seen or seen[-1].time_s - seen[0].time_s < hangs_s:
         return []
     last = [ball for ball in seen if ball.time_s >= seen[-1].time_s - LOOK_S]
     # What still swings a little is averaged over whole swings.
