@@ -237,8 +237,8 @@ def test_the_height_of_a_stand_is_asked_for(page: Page, console: LiveConsole) ->
         task = client.get("/task").json()
     asks = {"kind": "calibrate", "running": True, "waits_for": "height", "error": "", "lines": []}
     question = (
-        "Put the ball on a stand on the mark, best as high as a head. How high is its underside "
-        "above the floor?"
+        "Put the ball on a stand on the mark, about 1.7 m above the floor. How high is its "
+        "underside?"
     )
     told: list[Any] = []
 

@@ -39,7 +39,7 @@ export async function calibration(main, session) {
 
   const asks = (task) => task.waits_for === 'yes or no' || task.waits_for === 'height';
 
-  // The stand is measured to a millimetre.
+  // The ball's height is measured to a millimetre.
   function height() {
     const metres = settings.unit === 'in' ? 0.0254 : 0.01;
     const input = h('input', { type: 'number', id: 'height', inputMode: 'decimal', required: true,
