@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,6 +23,13 @@ from station.calibration.detect.detections import (
     WALL,
 )
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
+from station.calibration.guide.heights import (
+    HOOK,
+    measured_height,
+    out_of_sight,
+    recorded_heights,
+    wrong_height,
+)
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import SESSION, Session
 from station.calibration.guide.steps import (
@@ -46,12 +53,6 @@ _BOARDS = 3
 """Places of the board that a calibration asks for; a fourth buys next to nothing."""
 _AROUND = ("to the left of the mark", "to the right of the mark", "behind the mark")
 """Places of the ball: three that are not on one line show the floor's slope both ways."""
-_HOOK = (
-    "For accurate heights, the ball stands on a stand, or hangs on a string from a hook above the "
-    "mark and also shows what is vertical. Does it hang?"
-)
-_APART_M = 0.5
-"""Two heights of the ball that are nearer to each other than this say little more than one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +210,8 @@ class Procedure:
         ``again``: instead of those at which it was seen before.
         """
         if self.recordings is not None:
-            self._raised_in(self.recordings)
+            for recorded_kind, recorded_m in recorded_heights(self.recordings):
+                self.raise_ball(recorded_m, recorded_kind)
             return
         session = self._session_to_add_to()
         seen = {
@@ -221,13 +223,13 @@ class Procedure:
             return
         self.guide.title("Ball at two heights")
         begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
-        kind = begun or (HANGING if self.guide.answers_yes(_HOOK, usual=False) else STAND)
+        kind = begun or (HANGING if self.guide.answers_yes(HOOK, usual=False) else STAND)
         others_m = seen[kind] if begun else []
         best_m = list(HEIGHTS_M[kind])
         if begun:
             best_m = [max(best_m, key=lambda height_m: abs(height_m - others_m[0]))]
         while best_m:
-            height_m = self._measured_m(kind, best_m[0], others_m)
+            height_m = measured_height(self.guide, kind, best_m[0], others_m)
             if height_m is None:
                 return
             step = self.raise_ball(height_m, kind, ready=True, again=again and not others_m)
@@ -238,54 +240,6 @@ class Procedure:
             others_m.append(height_m)
             best_m.pop(0)
 
-    def _raised_in(self, recordings: Path) -> None:
-        """The ball at all heights that are recorded."""
-        kinds = {
-            folder: folder.name.partition("-")[0]
-            for folder in sorted(recordings.glob("*-*"))
-            if folder.name.partition("-")[0] in RAISED
-        }
-        if (hung := list(kinds.values()).count(HANGING)) > len(HEIGHTS_M[HANGING]):
-            raise CalibrationError(
-                f"{recordings} holds {hung} heights of the hanging ball: keep two, from one hook"
-            )
-        for folder, kind in kinds.items():
-            millimetres = folder.name.partition("-")[2]
-            if not millimetres.isdecimal():
-                raise CalibrationError(
-                    f"{folder} cannot be used: its name has to end with the height of the ball's "
-                    f"underside in millimetres, such as {kind}-1700"
-                )
-            self.raise_ball(1e-3 * int(millimetres), kind)
-
-    def _measured_m(self, kind: str, about_m: float, others_m: Sequence[float]) -> float | None:
-        """Height that the operator gives, not near one that was seen; None if left out."""
-        if kind == STAND:
-            where = (
-                f"Now about {about_m:g} m above the floor: a wrong measurement shows."
-                if others_m
-                else f"Put the ball on a stand on the mark, about {about_m:g} m above the floor."
-            )
-        else:
-            where = (
-                f"Now about {about_m:g} m above the floor, from the same hook, and still."
-                if others_m
-                else f"Hang the ball above the mark, about {about_m:g} m above the floor, and wait "
-                "until it hangs still."
-            )
-        while (height_m := self.guide.height_m(f"{where} How high is its underside?")) is not None:
-            near_m = [other for other in others_m if abs(other - height_m) < _APART_M]
-            if near_m:
-                self.guide.say(
-                    f"{height_m:g} m is too near to {near_m[0]:g} m, at which it was seen already: "
-                    f"change its height by {_APART_M:g} m or more"
-                )
-            elif not RAISED_M[0] <= height_m <= RAISED_M[1]:
-                self.guide.say(_out_of_sight(height_m))
-            else:
-                break
-        return height_m
-
     def raise_ball(
         self, height_m: float, kind: str, *, ready: bool = False, again: bool = False
     ) -> str:
@@ -295,7 +249,7 @@ class Procedure:
         ``ready``: it is there already; ``again``: instead of all heights before.
         """
         if not RAISED_M[0] <= height_m <= RAISED_M[1]:
-            raise CalibrationError(_out_of_sight(height_m))
+            raise CalibrationError(out_of_sight(height_m))
         step = f"{kind}-{round(1e3 * height_m)}"
         if ready:
             self.guide.count_down()
@@ -314,23 +268,6 @@ class Procedure:
                 self._ask_for_the_other()
         return step
 
-    def _wrong_height(self, step: str) -> str | None:
-        """Words on a height that is decimetres from where the cameras, found so far, see the ball.
-
-        It is known while the ball is still there, and not only with the solution.
-        """
-        from station.calibration.solve.solution import wrong_height
-
-        session = self._session_to_add_to()
-        if session is None or not session.balls:
-            return None
-        others = set(session.raised) - {step}
-        around = {place: balls for place, balls in session.around.items() if place not in others}
-        return wrong_height(
-            replace(session.observations(), around=around), session.lensed_cameras(),
-            radius_m=session.radius_m, reference=self.config.reference,
-        )  # fmt: skip
-
     def _ask_for_the_other(self) -> None:
         """Name the height that is missing, if the ball hung at one only."""
         session = self._session_to_add_to()
@@ -342,6 +279,12 @@ class Procedure:
                 f"now about {other_m:g} m above the floor, from the same hook, and still: two "
                 "heights show what is vertical"
             )
+
+    def _wrong_height(self, step: str) -> str | None:
+        session = self._session_to_add_to()
+        if session is None or not session.balls:
+            return None
+        return wrong_height(session, step, self.config.reference)
 
     def walls(self, asked: bool) -> None:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
@@ -469,13 +412,6 @@ class Procedure:
                     "moved since, begin anew: station calibrate --new"
                 )
             yield feed, session
-
-
-def _out_of_sight(height_m: float) -> str:
-    return (
-        f"a ball at {height_m:g} m cannot be used: its height is in metres, {RAISED_M[0]:g} to "
-        f"{RAISED_M[1]:g}"
-    )
 
 
 def _now() -> str:

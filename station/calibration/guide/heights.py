@@ -1,0 +1,104 @@
+"""Heights of the raised ball: as an operator measures them, as recordings name them, and as the
+cameras see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from station.calibration.detect.detections import HANGING, HEIGHTS_M, RAISED, RAISED_M, STAND
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import Session
+from station.core.errors import CalibrationError
+
+HOOK = (
+    "For accurate heights, the ball stands on a stand, or hangs on a string from a hook above the "
+    "mark and also shows what is vertical. Does it hang?"
+)
+_APART_M = 0.5
+"""Two heights of the ball that are nearer to each other than this say little more than one."""
+
+
+def out_of_sight(height_m: float) -> str:
+    """Words on a height at which no camera sees the ball."""
+    return (
+        f"a ball at {height_m:g} m cannot be used: its height is in metres, {RAISED_M[0]:g} to "
+        f"{RAISED_M[1]:g}"
+    )
+
+
+def measured_height(
+    guide: Guide, kind: str, about_m: float, others_m: Sequence[float]
+) -> float | None:
+    """Height (m) that the operator gives, not near one that was seen; None if left out."""
+    if kind == STAND:
+        where = (
+            f"Now about {about_m:g} m above the floor: a wrong measurement shows."
+            if others_m
+            else f"Put the ball on a stand on the mark, about {about_m:g} m above the floor."
+        )
+    else:
+        where = (
+            f"Now about {about_m:g} m above the floor, from the same hook, and still."
+            if others_m
+            else f"Hang the ball above the mark, about {about_m:g} m above the floor, and wait "
+            "until it hangs still."
+        )
+    while (height_m := guide.height_m(f"{where} How high is its underside?")) is not None:
+        near_m = [other for other in others_m if abs(other - height_m) < _APART_M]
+        if near_m:
+            guide.say(
+                f"{height_m:g} m is too near to {near_m[0]:g} m, at which it was seen already: "
+                f"change its height by {_APART_M:g} m or more"
+            )
+        elif not RAISED_M[0] <= height_m <= RAISED_M[1]:
+            guide.say(out_of_sight(height_m))
+        else:
+            break
+    return height_m
+
+
+def recorded_heights(recordings: Path) -> list[tuple[str, float]]:
+    """Kind (STAND, HANGING) and height (m) of each recorded step of the raised ball.
+
+    Raises:
+        CalibrationError: a folder's name has no height, or the ball hangs at more than two.
+    """
+    kinds = {
+        folder: folder.name.partition("-")[0]
+        for folder in sorted(recordings.glob("*-*"))
+        if folder.name.partition("-")[0] in RAISED
+    }
+    if (hung := list(kinds.values()).count(HANGING)) > len(HEIGHTS_M[HANGING]):
+        raise CalibrationError(
+            f"{recordings} holds {hung} heights of the hanging ball: keep two, from one hook"
+        )
+    found = []
+    for folder, kind in kinds.items():
+        millimetres = folder.name.partition("-")[2]
+        if not millimetres.isdecimal():
+            raise CalibrationError(
+                f"{folder} cannot be used: its name has to end with the height of the ball's "
+                f"underside in millimetres, such as {kind}-1700"
+            )
+        found.append((kind, 1e-3 * int(millimetres)))
+    return found
+
+
+def wrong_height(session: Session, step: str, reference: str) -> str | None:
+    """Words on a height that is decimetres from where the cameras, found so far, see the ball.
+
+    It is known while the ball is still there, and not only with the solution. None where it is
+    right, or too little of the waved ball was seen.
+    """
+    from station.calibration.solve import solution
+
+    others = set(session.raised) - {step}
+    around = {place: balls for place, balls in session.around.items() if place not in others}
+    return solution.wrong_height(
+        replace(session.observations(), around=around),
+        session.lensed_cameras(),
+        radius_m=session.radius_m,
+        reference=reference,
+    )
