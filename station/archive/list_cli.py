@@ -14,7 +14,13 @@ from station.core.commands import config_option
 from station.core.config import find_config, load_config
 from station.core.spool import Spool
 
-_LIMIT = click.IntRange(1, 1_000_000)
+_limit_option = click.option(
+    "--limit",
+    type=click.IntRange(1, 1_000_000),
+    default=20,
+    show_default=True,
+    help="largest number of scans to list, newest first",
+)
 _WORDS = {
     "accepted": "waiting",
     "reconstructing": "reconstructing",
@@ -27,13 +33,7 @@ _WORDS = {
 @click.command("list")
 @config_option
 @click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
-@click.option(
-    "--limit",
-    type=_LIMIT,
-    default=20,
-    show_default=True,
-    help="largest number of scans to list, newest first",
-)
+@_limit_option
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
 def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
     """List the scans of this booth, newest first, with their outcome.
@@ -50,13 +50,7 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
 @click.command()
 @click.argument("text")
 @config_option
-@click.option(
-    "--limit",
-    type=_LIMIT,
-    default=20,
-    show_default=True,
-    help="largest number of scans to list, newest first",
-)
+@_limit_option
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
 def find(text: str, config_path: Path | None, limit: int, as_json: bool) -> None:
     """Find scans whose label or id contains TEXT, ignoring case.

@@ -107,11 +107,6 @@ def _raised_to(height_m: float) -> State:
     return replace(state(), places={"hanging-700": place})
 
 
-def _told(words: str | None) -> None:
-    if words is not None:
-        raise CalibrationError(words)
-
-
 LIMITS = refusals.Limits()
 REFUSED: dict[str, Callable[[], object]] = {
     "has not been waved yet: station calibrate ball": partial(refusals.check_counts, coverage(0)),
@@ -158,8 +153,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
         refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
-    "said to be 0.70 m above the floor was seen near 1.70 m: measure the height": (
-        lambda: _told(refusals.wrong_height(places("hanging-700"), _raised_to(1.7)))
+    "0.34 degrees: hang the ball from one and the same hook at two heights": partial(
+        refusals.check_slope,
+        places("around-0", "hanging-400", "hanging-1700"),
+        world(slope_sigma_rad=6e-3),
     ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
         refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])
@@ -174,6 +171,14 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_mark, world(mark_height_m=0.12), RADIUS_M
     ),
 }
+
+
+def test_a_height_that_is_decimetres_off_is_named() -> None:
+    problem = places("hanging-700")
+    words = refusals.wrong_height(problem, _raised_to(1.7))
+    assert words is not None
+    assert "said to be 0.70 m above the floor was seen near 1.70 m: measure the height" in words
+    assert refusals.wrong_height(problem, _raised_to(0.75)) is None
 
 
 @pytest.mark.parametrize("words", REFUSED)
