@@ -13,7 +13,7 @@ from scan_distortion import distortion
 
 from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Observations
 from station.calibration.solve import solution as solution_module
-from station.calibration.solve.solution import Solution, wrong_height
+from station.calibration.solve.solution import Solution, height_words
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -336,11 +336,11 @@ def test_two_heights_that_were_exchanged_are_told_as_such(
     with pytest.raises(CalibrationError, match=r"said to be .* was seen near"):
         solved(procedure.booth.rig, exchanged)
     cameras = synthetic.factory(procedure.booth.rig)
-    told = wrong_height(exchanged, cameras, radius_m=0.1, reference=REFERENCE)
+    told = height_words(exchanged, cameras, radius_m=0.1, reference=REFERENCE)
     assert told is not None
-    assert wrong_height(seen, cameras, radius_m=0.1, reference=REFERENCE) is None
+    assert height_words(seen, cameras, radius_m=0.1, reference=REFERENCE) is None
     early = replace(exchanged, balls=exchanged.balls[:20])
-    assert wrong_height(early, cameras, radius_m=0.1, reference=REFERENCE) is None
+    assert height_words(early, cameras, radius_m=0.1, reference=REFERENCE) is None
 
 
 class _MovedHook(VirtualProcedure):

@@ -107,15 +107,20 @@ def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationSto
 
 def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     laid: list[tuple[str, str]] = []
-    monkeypatch.setattr(Procedure, "_lay", lambda _, step, title, __: laid.append((step, title)))
+    monkeypatch.setattr(Guide, "step", lambda _, title, *__, **___: laid.append(("", title)))
+
+    def see(_: Procedure, height_m: float, kind: str, **__: bool) -> None:
+        laid[-1] = (f"{kind} {height_m:g}", laid[-1][1])
+
+    monkeypatch.setattr(Procedure, "_see_raised", see)
     done = _run(config, "stand", "--height", "1.7")
     assert done.exit_code == 0, done.output
     assert laid == [
-        ("stand-1700", "Ball on a stand on the mark, its underside 1.7 m above the floor")
+        ("stand 1.7", "Ball on a stand on the mark, its underside 1.7 m above the floor")
     ]
     assert _run(config, "stand", "--height", "0.7", "--hanging").exit_code == 0
     assert laid.pop() == (
-        "hanging-700",
+        "hanging 0.7",
         "Ball hanging above the mark, its underside 0.7 m above the floor",
     )
     in_cm = _run(config, "stand", "--height", "170")

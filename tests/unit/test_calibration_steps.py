@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.detections import BallDetection
+from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.calibration.guide import finder
 from station.calibration.guide.feed import Feed, TimedFrame
 from station.calibration.guide.finder import BallFinder
@@ -101,17 +103,25 @@ class _Looks:
         return [TimedFrame(name, self._next / INDEPENDENT_HZ, image, 1e-3) for name in _CAMERAS]
 
 
+_PERIOD_S, _PHASE = 2.3, 0.7
+
+
 def _hung(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, *, lasts_s: float, swing_m: float, every: int = 1
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    lasts_s: float,
+    swing_m: float,
+    seen: Callable[[float], bool] = lambda _: True,
 ) -> list[BallDetection]:
-    """The detections kept of a ball that swings; one frame in ``every`` shows it."""
+    """The detections kept of a ball that swings; ``seen``: whether it is, at a time (s)."""
     rng = np.random.default_rng(3)
 
     def find(*args: Any, **_: Any) -> BallDetection | None:
         _, camera, _, time_s = args
-        if round(time_s * INDEPENDENT_HZ) % every:
+        if not seen(time_s):
             return None
-        phase = 2.0 * np.pi * time_s / 2.3 + 0.7
+        phase = 2.0 * np.pi * time_s / _PERIOD_S + _PHASE
         center_m = np.array([swing_m * np.sin(phase), 0.0, 1.5]) + rng.normal(0.0, 5e-4, 3)
         return BallDetection(
             camera.name, time_s, center_m, np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4))
@@ -121,8 +131,7 @@ def _hung(
     rig = default_rig().cameras
     session = Session.begin(folder, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
     guide = Guide(attended=False, countdown_s=0.0)
-    rest_ball(cast(Feed, _Looks(lasts_s)), session, guide, "hanging-1800")
-    return session.around["hanging-1800"]
+    return rest_ball(cast(Feed, _Looks(lasts_s)), session, guide, "hanging-1800")
 
 
 def test_a_swinging_ball_is_averaged_over_whole_swings(
@@ -139,16 +148,52 @@ def test_a_hanging_ball_that_is_lost_now_and_then_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the edge of an image: 60 detections without a gap were asked for."""
-    kept = _hung(tmp_path, monkeypatch, lasts_s=3.5, swing_m=1e-3, every=2)
+    kept = _hung(
+        tmp_path, monkeypatch, lasts_s=3.5, swing_m=1e-3,
+        seen=lambda time_s: round(time_s * INDEPENDENT_HZ) % 2 == 0,
+    )  # fmt: skip
     assert {ball.camera for ball in kept} == set(_CAMERAS)
 
 
-@pytest.mark.parametrize(("lasts_s", "swing_m"), [(2.0, 1e-3), (6.0, 0.05)], ids=["short", "swing"])
+@pytest.mark.parametrize(
+    ("lasts_s", "swing_m", "seen"),
+    [
+        (2.0, 1e-3, lambda _: True),
+        (6.0, 0.05, lambda _: True),
+        (6.0, 8e-3, lambda time_s: np.sin(2.0 * np.pi * time_s / _PERIOD_S + _PHASE) > 0.0),
+        (6.0, 1e-3, lambda time_s: time_s < 0.1 or time_s > 4.6),
+    ],
+    ids=["short", "swing", "one side", "early glimpse"],
+)
 def test_a_ball_that_hangs_too_shortly_or_swings_is_not_at_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_s: float, swing_m: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    lasts_s: float,
+    swing_m: float,
+    seen: Callable[[float], bool],
 ) -> None:
+    """Seen on one side of its swing, it was 5 mm off; a glimpse and 1.1 s counted as 4 s."""
     with pytest.raises(CalibrationError, match=r"no camera sees the ball at rest for 2\.5 s"):
-        _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m)
+        _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m, seen=seen)
+
+
+@pytest.mark.parametrize("period_s", [1.1, 1.9, 2.7, 3.1])
+def test_the_mean_of_whole_swings_is_their_middle(period_s: float) -> None:
+    """The mean of all that is seen in the same time is up to a fifth of the amplitude off."""
+    times_s = np.arange(0.0, LOOK_S, 1.0 / INDEPENDENT_HZ)
+    rng = np.random.default_rng(7)
+    off_m = []
+    for phase in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False):
+        swing_m = 8e-3 * np.sin(2.0 * np.pi * times_s / period_s + phase)
+        centers_m = np.array([0.0, 0.0, 1.5]) + np.outer(swing_m, [1.0, 0.0, 0.0])
+        centers_m += rng.normal(0.0, 5e-4, centers_m.shape)
+        seen = [
+            BallDetection("a", time_s, center_m, np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4)))
+            for time_s, center_m in zip(times_s.tolist(), centers_m, strict=True)
+        ]
+        kept = np.array([ball.center_m[0] for ball in whole_swings(seen)])
+        off_m.append(abs(kept.mean()))
+    assert max(off_m) < 5e-4
 
 
 def test_no_more_frames_are_looked_at_than_are_worth_it(

@@ -50,11 +50,10 @@ def guided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Procedure, 
     monkeypatch.setattr(
         procedure, "look_at_wall", lambda _, own, __, place: own.record_wall(f"wall-{place}", [])
     )
-    monkeypatch.setattr(
-        procedure, "rest_ball", lambda _, own, __, step: own.record_resting(step, [])
-    )
+    monkeypatch.setattr(procedure, "rest_ball", lambda *_: [])
     guide = Guide(attended=True, countdown_s=COUNTDOWN_S)
-    begun = Procedure(cast(BoothConfig, None), store, None, guide)
+    config = cast(BoothConfig, SimpleNamespace(reference=next(iter(session.cameras))))
+    begun = Procedure(config, store, None, guide)
     assert session.done(EMPTY)
     return begun, session, looked
 
@@ -208,10 +207,10 @@ def test_a_single_step_names_the_height_that_is_missing(
     """A calibration without it was used, and nothing said that the vertical was unknown."""
     begun, _, _ = guided
     unattended = replace(begun, guide=replace(begun.guide, attended=False))
-    for height_m, missing in ((0.75, "1.8 m"), (1.8, "")):
-        unattended.raise_ball(height_m, "hanging")
-        said = capsys.readouterr().out
-        assert (f"now about {missing} above the floor, from the same hook" in said) == bool(missing)
+    unattended.raise_ball(0.75, "hanging")
+    assert "now about 1.8 m above the floor, from the same hook" in capsys.readouterr().out
+    unattended.raise_ball(1.8, "hanging")
+    assert "from the same hook" not in capsys.readouterr().out
 
 
 def test_a_height_that_is_decimetres_off_is_asked_for_again(
@@ -223,10 +222,7 @@ def test_a_height_that_is_decimetres_off_is_asked_for_again(
     """It was told with the solution, when the ball had been taken down."""
     _, session, looked = guided
 
-    def wrong(_: Procedure, step: str) -> str | None:
-        return "seen near 1.8 m" if step == "hanging-1080" else None
-
-    monkeypatch.setattr(Procedure, "_wrong_height", wrong)
+    monkeypatch.setattr(procedure, "wrong_height", _wrong_at_1080)
     asked = _raise(guided, monkeypatch, [1.08, 1.8, 0.7])
     assert asked[0] == asked[1]
     assert looked == ["hanging-1080", "hanging-1800", "hanging-700"]
@@ -235,10 +231,65 @@ def test_a_height_that_is_decimetres_off_is_asked_for_again(
     assert seconds
 
 
+def _wrong_at_1080(_: Session, step: str, *__: object) -> str | None:
+    return "seen near 1.8 m" if step == "hanging-1080" else None
+
+
+def test_a_wrong_height_replaces_nothing(
+    guided: tuple[Procedure, Session, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was kept beside the right one, and the height that was missing was not asked for."""
+    begun, session, _ = guided
+    session.record_resting("hanging-1800", [])
+    session.record_resting("hanging-700", [])
+    monkeypatch.setattr(procedure, "wrong_height", _wrong_at_1080)
+    unattended = replace(begun, guide=replace(begun.guide, attended=False))
+    with pytest.raises(CalibrationError, match=r"seen near 1\.8 m"):
+        unattended.raise_ball(1.08, "hanging")
+    assert Session.load(session.folder).raised == ["hanging-1800", "hanging-700"]
+
+
+@pytest.mark.parametrize("ends", [CalibrationError("not seen"), KeyboardInterrupt()], ids=type)
+def test_heights_are_kept_until_others_are_seen(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    ends: BaseException,
+) -> None:
+    """They were forgotten before anybody had looked for the ball at the new one."""
+    _, session, _ = guided
+    session.record_resting("hanging-1800", [])
+    session.record_resting("hanging-700", [])
+
+    def not_seen(*_: object) -> None:
+        raise ends
+
+    monkeypatch.setattr(procedure, "rest_ball", not_seen)
+    with pytest.raises(type(ends)):
+        _raise(guided, monkeypatch, [1.7], again=True)
+    assert Session.load(session.folder).raised == ["hanging-1800", "hanging-700"]
+    assert seconds
+
+
+def test_a_kind_that_is_given_is_not_asked_for(
+    guided: tuple[Procedure, Session, list[str]],
+    seconds: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """--hanging without a height was ignored, and Enter led to a stand."""
+    begun, session, _ = guided
+    heights_m = [1.8, 0.7]
+    monkeypatch.setattr(click, "prompt", lambda *_, **__: heights_m.pop(0))
+    begun.raised(again=True, kind="hanging")
+    assert session.raised == ["hanging-1800", "hanging-700"]
+    assert seconds
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (["hanging-low"], "has to end with the height of the ball's underside in millimetres"),
+        (["hanging-low"], "does not end with the height of the ball's underside in millimetres"),
+        (["hanging-0700"], "does not end with the height .* 300 to 2200, such as hanging-1700"),
         (["hanging-700", "hanging-1200", "hanging-1800"], "3 heights of the hanging ball"),
     ],
 )
@@ -253,16 +304,35 @@ def test_recorded_heights_that_cannot_be_used_are_named(
     assert looked == []
 
 
+def _replayed(begun: Procedure, recordings: Path) -> Procedure:
+    return replace(begun, recordings=recordings, guide=replace(begun.guide, attended=False))
+
+
 def test_all_recorded_heights_are_looked_at(
     guided: tuple[Procedure, Session, list[str]], tmp_path: Path
 ) -> None:
     begun, session, looked = guided
     for name in ("hanging-700", "hanging-1800", "stand-1500", "standing-1200"):
         (tmp_path / "recordings" / name).mkdir(parents=True)
-    unattended = replace(begun.guide, attended=False)
-    replace(begun, recordings=tmp_path / "recordings", guide=unattended).raised()
+    (tmp_path / "recordings" / "stand-plan.pdf").touch()
+    _replayed(begun, tmp_path / "recordings").raised()
     assert looked == ["hanging-1800", "hanging-700", "stand-1500"]
     assert session.raised == looked
+
+
+def test_recorded_heights_replace_those_before(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path
+) -> None:
+    """A wrong height stayed beside them."""
+    begun, session, _ = guided
+    session.record_resting("stand-1200", [])
+    for name in ("stand-900", "stand-1700"):
+        (tmp_path / "recordings" / name).mkdir(parents=True)
+    replayed = _replayed(begun, tmp_path / "recordings")
+    replayed.raised(again=True)
+    assert session.raised == ["stand-1700", "stand-900"]
+    with pytest.raises(CalibrationError, match=r"no recording of the ball on a stand or hanging"):
+        _replayed(begun, tmp_path).raised(again=True)
 
 
 def test_no_stand_is_asked_about_once(

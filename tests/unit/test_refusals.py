@@ -153,10 +153,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
         refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
-    "0.34 degrees: hang the ball from one and the same hook at two heights": partial(
+    "what is vertical is only known to within 0.29 degrees: .*; if it did hang": partial(
         refusals.check_slope,
         places("around-0", "hanging-400", "hanging-1700"),
-        world(slope_sigma_rad=6e-3),
+        world(slope_sigma_rad=5e-3),
     ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
         refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])
@@ -175,10 +175,16 @@ REFUSED: dict[str, Callable[[], object]] = {
 
 def test_a_height_that_is_decimetres_off_is_named() -> None:
     problem = places("hanging-700")
-    words = refusals.wrong_height(problem, _raised_to(1.7))
+    words = refusals.height_words(problem, _raised_to(1.7))
     assert words is not None
     assert "said to be 0.70 m above the floor was seen near 1.70 m: measure the height" in words
-    assert refusals.wrong_height(problem, _raised_to(0.75)) is None
+    assert refusals.height_words(problem, _raised_to(0.75)) is None
+
+
+def test_nothing_is_advised_that_was_done() -> None:
+    """A ball that had hung at two heights was to be hung at two heights."""
+    assert refusals.slope_words(places("around-0", "hanging-400", "hanging-1700")) == ""
+    assert refusals.slope_words(places("around-0", "stand-400", "stand-1700"))
 
 
 @pytest.mark.parametrize("words", REFUSED)

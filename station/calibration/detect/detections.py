@@ -38,6 +38,8 @@ PLACES = (AROUND, *RAISED)
 FLOOR = "floor"
 _FEWEST_PATCHES = 3
 """Fewer do not make a plane."""
+_NEAREST_M, _FARTHEST_M = 0.1, 20.0
+"""Ends of what any depth camera measures."""
 _RADIUS_CERTAIN = 0.045
 """Largest standard deviation of a detection's own radius, as a share of the radius, ..."""
 _COVERED_CERTAIN, _COVERED = 0.034, 1.1
@@ -57,10 +59,19 @@ def raised_height_m(step: str) -> float | None:
     kind, _, millimetres = step.partition("-")
     if kind not in RAISED:
         return None
-    known = millimetres.isascii() and millimetres.isdecimal()
-    if not known or not RAISED_M[0] <= 1e-3 * int(millimetres) <= RAISED_M[1]:
-        raise ValueError(f"{step} does not end with a height in millimetres, 300 to 2200")
-    return 1e-3 * int(millimetres)
+    height_m = 1e-3 * int(millimetres) if millimetres.isdecimal() else 0.0
+    if not RAISED_M[0] <= height_m <= RAISED_M[1] or step != raised_step(kind, height_m):
+        low, high = (1e3 * height for height in RAISED_M)
+        raise ValueError(
+            f"{step} does not end with the height of the ball's underside in millimetres, "
+            f"{low:.0f} to {high:.0f}, such as {kind}-1700"
+        )
+    return height_m
+
+
+def raised_step(kind: str, height_m: float) -> str:
+    """Name of the step in which the ball is at a height (STAND, HANGING)."""
+    return f"{kind}-{round(1e3 * height_m)}"
 
 
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:
@@ -139,8 +150,11 @@ class BallDetection:
             )
             if min(seen.center_m[2], seen.radius_m, seen.radius_sigma_m) <= 0.0:
                 raise ValueError("distance, radius and its standard deviation are above 0")
+            if np.linalg.norm(seen.center_m) > _FARTHEST_M:
+                raise ValueError(f"no camera sees a ball beyond {_FARTHEST_M:g} m")
             if np.linalg.eigvalsh(seen.covariance_m2)[0] <= 0.0:
                 raise ValueError("the covariance of the centre is not positive")
+            _check_patches(seen.patches)
             return seen
         except (KeyError, TypeError, ValueError, ArithmeticError) as cause:
             raise FormatError(f"a ball detection cannot be read ({cause})") from None
@@ -181,6 +195,7 @@ class PlaneObservation:
             )
             if len(seen.patches) < _FEWEST_PATCHES:
                 raise ValueError(f"{_FEWEST_PATCHES} patches are needed, not {len(seen.patches)}")
+            _check_patches(seen.patches)
             return seen
         except (KeyError, TypeError, ValueError, ArithmeticError) as cause:
             raise FormatError(f"a plane observation cannot be read ({cause})") from None
@@ -215,6 +230,19 @@ class Observations:
                 for place in places
             },
         )
+
+
+def _check_patches(patches: Array) -> None:
+    """Refuse patches (k, 4) that no camera gives.
+
+    Raises:
+        ValueError: a depth, or its variance.
+    """
+    inverse, variance = patches[:, 2], patches[:, 3]
+    if np.any(inverse < 1.0 / _FARTHEST_M) or np.any(inverse > 1.0 / _NEAREST_M):
+        raise ValueError(f"depths lie between {_NEAREST_M:g} and {_FARTHEST_M:g} m")
+    if np.any(variance <= 0.0) or np.any(variance > 1.0 / _NEAREST_M**2):
+        raise ValueError("the variance of an inverse depth is above 0 and finite")
 
 
 def _rounded(patches: Array) -> list[list[float]]:

@@ -237,7 +237,7 @@ def stand(procedure: Procedure, height_m: float | None, hanging: bool) -> None:
     if height_m is not None:
         procedure.raise_ball(height_m, HANGING if hanging else STAND)
     elif procedure.guide.attended or procedure.recordings is not None:
-        procedure.raised(again=True)
+        procedure.raised(again=True, kind=HANGING if hanging else None)
     else:
         raise click.UsageError("nobody is asked with --yes: give --height METRES")
 

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from station.calibration.detect.detections import HANGING, HEIGHTS_M, RAISED, RAISED_M, STAND
+from station.calibration.detect.detections import (
+    HANGING,
+    HEIGHTS_M,
+    RAISED_M,
+    STAND,
+    BallDetection,
+    raised_height_m,
+)
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
 from station.core.errors import CalibrationError
@@ -65,39 +72,38 @@ def recorded_heights(recordings: Path) -> list[tuple[str, float]]:
     Raises:
         CalibrationError: a folder's name has no height, or the ball hangs at more than two.
     """
-    kinds = {
-        folder: folder.name.partition("-")[0]
-        for folder in sorted(recordings.glob("*-*"))
-        if folder.name.partition("-")[0] in RAISED
-    }
-    if (hung := list(kinds.values()).count(HANGING)) > len(HEIGHTS_M[HANGING]):
+    found = []
+    for folder in sorted(path for path in recordings.glob("*-*") if path.is_dir()):
+        try:
+            height_m = raised_height_m(folder.name)
+        except ValueError as cause:
+            raise CalibrationError(f"{folder} cannot be used: {cause}") from None
+        if height_m is not None:
+            found.append((folder.name.partition("-")[0], height_m))
+    hung = sum(kind == HANGING for kind, _ in found)
+    if hung > len(HEIGHTS_M[HANGING]):
         raise CalibrationError(
             f"{recordings} holds {hung} heights of the hanging ball: keep two, from one hook"
         )
-    found = []
-    for folder, kind in kinds.items():
-        millimetres = folder.name.partition("-")[2]
-        if not millimetres.isdecimal():
-            raise CalibrationError(
-                f"{folder} cannot be used: its name has to end with the height of the ball's "
-                f"underside in millimetres, such as {kind}-1700"
-            )
-        found.append((kind, 1e-3 * int(millimetres)))
     return found
 
 
-def wrong_height(session: Session, step: str, reference: str) -> str | None:
+def wrong_height(
+    session: Session, step: str, balls: Sequence[BallDetection], reference: str
+) -> str | None:
     """Words on a height that is decimetres from where the cameras, found so far, see the ball.
 
     It is known while the ball is still there, and not only with the solution. None where it is
     right, or too little of the waved ball was seen.
     """
+    if not session.balls:
+        return None
     from station.calibration.solve import solution
 
-    others = set(session.raised) - {step}
-    around = {place: balls for place, balls in session.around.items() if place not in others}
-    return solution.wrong_height(
-        replace(session.observations(), around=around),
+    raised = set(session.raised)
+    laid = {place: seen for place, seen in session.around.items() if place not in raised}
+    return solution.height_words(
+        replace(session.observations(), around={**laid, step: balls}),
         session.lensed_cameras(),
         radius_m=session.radius_m,
         reference=reference,

@@ -21,6 +21,8 @@ from station.calibration.detect.detections import (
     RAISED_M,
     STAND,
     WALL,
+    BallDetection,
+    raised_step,
 )
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.heights import (
@@ -204,14 +206,14 @@ class Procedure:
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
 
-    def raised(self, *, again: bool = False) -> None:
+    def raised(self, *, again: bool = False, kind: str | None = None) -> None:
         """The ball at two measured heights that the operator gives; at all that are recorded.
 
-        ``again``: instead of those at which it was seen before.
+        ``again``: instead of those at which it was seen before; ``kind``: STAND or HANGING, or None
+        to ask.
         """
         if self.recordings is not None:
-            for recorded_kind, recorded_m in recorded_heights(self.recordings):
-                self.raise_ball(recorded_m, recorded_kind)
+            self._raised_in(self.recordings, again)
             return
         session = self._session_to_add_to()
         seen = {
@@ -223,7 +225,9 @@ class Procedure:
             return
         self.guide.title("Ball at two heights")
         begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
-        kind = begun or (HANGING if self.guide.answers_yes(HOOK, usual=False) else STAND)
+        kind = begun or kind
+        if kind is None:
+            kind = HANGING if self.guide.answers_yes(HOOK, usual=False) else STAND
         others_m = seen[kind] if begun else []
         best_m = list(HEIGHTS_M[kind])
         if begun:
@@ -232,41 +236,61 @@ class Procedure:
             height_m = measured_height(self.guide, kind, best_m[0], others_m)
             if height_m is None:
                 return
-            step = self.raise_ball(height_m, kind, ready=True, again=again and not others_m)
-            if words := self._wrong_height(step):
+            self.guide.count_down()
+            if words := self._see_raised(height_m, kind, again=again and not others_m):
                 self.guide.say(words)
-                self.session().forget_raised([step])
                 continue
             others_m.append(height_m)
             best_m.pop(0)
 
-    def raise_ball(
-        self, height_m: float, kind: str, *, ready: bool = False, again: bool = False
-    ) -> str:
-        """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
-        the floor; the step's name.
+    def _raised_in(self, recordings: Path, again: bool) -> None:
+        recorded = recorded_heights(recordings)
+        if again and not recorded:
+            raise CalibrationError(
+                f"{recordings} holds no recording of the ball on a stand or hanging (a folder such "
+                f"as {STAND}-1700 or {HANGING}-1800)"
+            )
+        for kind, height_m in recorded:
+            self.raise_ball(height_m, kind, again=again)
+            again = False
 
-        ``ready``: it is there already; ``again``: instead of all heights before.
+    def raise_ball(self, height_m: float, kind: str, *, again: bool = False) -> None:
+        """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
+        the floor.
+
+        ``again``: instead of all heights before.
+
+        Raises:
+            CalibrationError: it is not seen there.
         """
         if not RAISED_M[0] <= height_m <= RAISED_M[1]:
             raise CalibrationError(out_of_sight(height_m))
-        step = f"{kind}-{round(1e3 * height_m)}"
-        if ready:
-            self.guide.count_down()
-            self._see_at_rest(step, again=again)
+        if kind == HANGING:
+            where = f"hanging above the mark, its underside {height_m:g} m above the floor"
+            instruction = "Wait until it hangs still, and step back."
         else:
-            if kind == HANGING:
-                where = f"hanging above the mark, its underside {height_m:g} m above the floor"
-                instruction = "Wait until it hangs still, and step back."
-            else:
-                where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
-                instruction = "Put it up and step back."
-            self._lay(step, f"Ball {where}", instruction)
-            if words := self._wrong_height(step):
-                self.guide.say(words)
-            elif kind == HANGING and self.recordings is None:
-                self._ask_for_the_other()
-        return step
+            where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
+            instruction = "Put it up and step back."
+        self.guide.step(f"Ball {where}", instruction, lays=True)
+        if words := self._see_raised(height_m, kind, again=again):
+            raise CalibrationError(words)
+        if kind == HANGING and self.recordings is None:
+            self._ask_for_the_other()
+
+    def _see_raised(self, height_m: float, kind: str, *, again: bool) -> str | None:
+        """Keep the ball at a height; words on one that is wrong, which is not kept."""
+        step = raised_step(kind, height_m)
+        session, balls = self._see_at_rest(step)
+        if words := wrong_height(session, step, balls, self.config.reference):
+            return words
+        before = session.raised
+        session.record_resting(step, balls)
+        if again and (others := [place for place in session.raised if place != step]):
+            session.forget_raised(others)
+        gone = [place for place in before if place not in session.raised]
+        if gone:
+            self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
+        return None
 
     def _ask_for_the_other(self) -> None:
         """Name the height that is missing, if the ball hung at one only."""
@@ -279,12 +303,6 @@ class Procedure:
                 f"now about {other_m:g} m above the floor, from the same hook, and still: two "
                 "heights show what is vertical"
             )
-
-    def _wrong_height(self, step: str) -> str | None:
-        session = self._session_to_add_to()
-        if session is None or not session.balls:
-            return None
-        return wrong_height(session, step, self.config.reference)
 
     def walls(self, asked: bool) -> None:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
@@ -358,18 +376,13 @@ class Procedure:
 
     def _lay(self, step: str, title: str, instruction: str) -> None:
         self.guide.step(title, instruction, lays=True)
-        self._see_at_rest(step)
+        session, balls = self._see_at_rest(step)
+        session.record_resting(step, balls)
 
-    def _see_at_rest(self, step: str, *, again: bool = False) -> None:
+    def _see_at_rest(self, step: str) -> tuple[Session, list[BallDetection]]:
         with self._feed(step) as (feed, session):
             self._remark_on_ghosts(session)
-            before = session.raised
-            if again and before:
-                session.forget_raised(before)
-            rest_ball(feed, session, self.guide, step)
-            gone = [place for place in before if place not in session.raised]
-            if gone:
-                self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
+            return session, rest_ball(feed, session, self.guide, step)
 
     def _remark_on_ghosts(self, session: Session) -> None:
         if not session.done(EMPTY):

@@ -316,6 +316,8 @@ class Session:
         elif step == "forget-balls":
             self.balls.clear()
         elif step == _FORGET_RAISED:
+            if not isinstance(entry["places"], list):
+                raise ValueError("places are a list")
             for place in entry["places"]:
                 self.around.pop(str(place), None)
         elif step == BALL:
@@ -330,12 +332,12 @@ class Session:
             self.around[step] = self._balls(entry)
         elif step == "board":
             for name, lens in entry["lenses"].items():
+                self._check_camera(str(name))
                 self.lenses.pop(str(name), None)
                 if lens is not None:
-                    self.lenses[str(name)] = Lens(
-                        finite_numbers(lens["K"], (3, 3)).tolist(),
-                        finite_numbers(lens["distortion"], (None,)).tolist(),
-                    )
+                    self.lenses[str(name)] = _lens(lens)
+        elif step != EMPTY and not step.startswith(WALL):
+            raise ValueError(f"there is no step {step}")
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
@@ -361,9 +363,12 @@ class Session:
             ValueError: one is not.
         """
         for one in seen:
-            if one.camera not in self.cameras:
-                raise ValueError(f"there is no camera {one.camera}")
+            self._check_camera(one.camera)
         return seen
+
+    def _check_camera(self, name: str) -> None:
+        if name not in self.cameras:
+            raise ValueError(f"there is no camera {name}")
 
     def _moved_by(self, first_s: float) -> float:
         """Shift of a run's times that puts it after the runs before."""
@@ -371,6 +376,19 @@ class Session:
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
         return self._later_s
+
+
+def _lens(document: Mapping[str, Any]) -> Lens:
+    """Intrinsics of the journal.
+
+    Raises:
+        ValueError: they are of no lens.
+    """
+    K = finite_numbers(document["K"], (3, 3))
+    distortion = finite_numbers(document["distortion"], (5,))
+    if min(K[0, 0], K[1, 1]) <= 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
+        raise ValueError("K has focal lengths above 0, and the last row 0, 0, 1")
+    return Lens(K.tolist(), distortion.tolist())
 
 
 def _listed(heights_m: Mapping[str, float]) -> str:

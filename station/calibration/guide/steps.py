@@ -11,7 +11,7 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import HANGING, BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import smoothed, static_view
-from station.calibration.detect.swing import LOOK_S, whole_swings
+from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
@@ -116,8 +116,8 @@ def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
         )
 
 
-def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
-    """Wait until the ball lies still where it was put, and keep where the cameras see it.
+def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[BallDetection]:
+    """Wait until the ball lies still where it was put: its detections there.
 
     Raises:
         CalibrationError: it was not seen at rest.
@@ -149,8 +149,8 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> None:
             f"it hangs, and check that its radius is {session.radius_m:g} m "
             "(calibrate.ball_radius_m)"
         )
-    session.record_resting(step, [ball for kept in still.values() for ball in kept])
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
+    return [ball for kept in still.values() for ball in kept]
 
 
 def _at_rest(
@@ -166,11 +166,11 @@ def _last(seen: list[BallDetection], hangs_s: float | None) -> list[BallDetectio
     """The last detections of one camera: enough of them, or none."""
     if hangs_s is None:
         return seen[-_RESTING_DETECTIONS:] if len(seen) >= _RESTING_DETECTIONS else []
-    if not seen or seen[-1].time_s - seen[0].time_s < hangs_s:
+    last = since_last_gap([ball for ball in seen if ball.time_s >= seen[-1].time_s - LOOK_S])
+    if len(last) < _HANGING_DETECTIONS or last[-1].time_s - last[0].time_s < hangs_s - GAP_S:
         return []
-    last = [ball for ball in seen if ball.time_s >= seen[-1].time_s - LOOK_S]
     # What still swings a little is averaged over whole swings.
-    return whole_swings(last) if len(last) >= _HANGING_DETECTIONS else []
+    return whole_swings(last)
 
 
 def _is_still(seen: list[BallDetection]) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.contacts import PLUMB, contact_error_m
+from station.calibration.adjust.contacts import PLUMB, contact_error_m, plumb_ends
 from station.calibration.adjust.problem import Problem, State
 from station.calibration.adjust.residuals import MEDIAN
 from station.calibration.detect.coverage import Coverage
@@ -64,6 +64,11 @@ HANGING_WORDS = (
     "hang the ball from one and the same hook at two heights, and let it come to rest (station "
     f"calibrate stand --hanging --height {HEIGHTS_M[HANGING][0]:g}, then --height "
     f"{HEIGHTS_M[HANGING][1]:g})"
+)
+_HANG_ANEW = (
+    f"{HANGING_WORDS}; if it did hang so, something lay under the ball on the floor, or the floor "
+    "slopes by more than 5 mm per metre: take it away, or put the ball on a stand, and start again "
+    "with station calibrate --new"
 )
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 AROUND_WORDS = (
@@ -221,10 +226,11 @@ def remedy(done: bool, step: str) -> str:
 
 
 def slope_words(problem: Problem) -> str:
-    """Advice against a doubtful slope: of what helps, the next that was not done."""
+    """Advice against a doubtful vertical: of what helps, the next that was not done; "" if all
+    was."""
     if not any(place.startswith(AROUND) for place in problem.resting):
         return AROUND_WORDS
-    return HANGING_WORDS
+    return HANGING_WORDS if plumb_ends(problem) is None else ""
 
 
 def check_predicted(
@@ -245,15 +251,21 @@ def check_predicted(
             )
 
 
+def leveled_by(problem: Problem) -> str:
+    """Words of what the world's horizontal is taken from."""
+    return "the floor's slope" if plumb_ends(problem) is None else "what is vertical"
+
+
 def check_slope(problem: Problem, world_poses: WorldPoses) -> None:
     if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
+        advice = slope_words(problem) or _HANG_ANEW
         raise CalibrationError(
-            "the floor's slope is only known to within "
-            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {slope_words(problem)}"
+            f"{leveled_by(problem)} is only known to within "
+            f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {advice}"
         )
 
 
-def wrong_height(problem: Problem, start: State) -> str | None:
+def height_words(problem: Problem, start: State) -> str | None:
     """Words on a height that is decimetres off: two that were exchanged would be another radius."""
     offs_m = {place: contact_error_m(problem, start, place) for place in problem.resting}
     laid = [abs(off_m) for place, off_m in offs_m.items() if place not in problem.heights_m]
@@ -290,9 +302,7 @@ def check_doubts(problem: Problem, state: State) -> None:
     if worst.places == (PLUMB,):
         raise CalibrationError(
             f"the hanging ball's places are {1e3 * worst.off_m:.0f} mm from above one another: "
-            f"{HANGING_WORDS}; if it did hang so, something lay under the ball on the floor, or "
-            "the floor slopes by more than 5 mm per metre: take it away, or put the ball on a "
-            "stand, and start again with station calibrate --new"
+            f"{_HANG_ANEW}"
         )
     raise CalibrationError(
         "the places of the ball on the floor do not lie on one floor (one is "

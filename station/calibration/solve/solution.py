@@ -76,6 +76,8 @@ class Solution:
     """Offset of each camera's clock against the reference's."""
     radius_m: float
     """The ball's, as all cameras measured it."""
+    leveled_by: str
+    """Words of what the world's horizontal is taken from."""
 
     def summary(self) -> list[str]:
         """Lines for the operator."""
@@ -102,7 +104,7 @@ class Solution:
                 f"{1e3 * SIGMAS_95 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
             )
         slope_deg = np.degrees(self.world_poses.slope_sigma_rad)
-        lines.append(f"the floor's slope is known to within {slope_deg:.2f} degrees")
+        lines.append(f"{self.leveled_by} is known to within {slope_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
 
     @property
@@ -161,18 +163,10 @@ def solve(
             coverage.add(ball)
         refusals.check_counts(coverage)
         measured_m = refusals.check_radius(observations.balls, radius_m)
-        # Balls that are partly covered are good enough for first poses, and to tell what is a ball.
-        seen = sorted_detections(observations.balls, list(cameras), radius_m, held=False)
         refusals.check_rest(observations, front_cameras)
-
         progress("finding the relative positions of the cameras")
-        pairs = estimate_pairs({name: own.track for name, own in seen.items()})
-        refusals.check_pairs(seen, pairs)
-        poses = chain_poses(pairs, reference, list(cameras))
-        refusals.check_connected(cameras, poses)
-
-        problem = _problem(observations, cameras, seen, poses, radius_m, reference)
-        if words := refusals.wrong_height(problem, first_state(problem, poses)):
+        problem, poses = _first_problem(observations, cameras, radius_m, reference)
+        if words := refusals.height_words(problem, first_state(problem, poses)):
             raise CalibrationError(words)
         progress("solving, with a fifth of the seconds kept for the test")
         training, tested, found = _tested(problem, poses)
@@ -193,10 +187,11 @@ def solve(
         refusals.check_predicted(predicted, limits, coverage, stood, boarded)
         rig = replace(rig, predicted=predicted)
         weak = _advice(problem, predicted, world_poses, limits, coverage)
-        return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
+        leveled_by = refusals.leveled_by(problem)
+        return Solution(rig, world_poses, found, weak, state.clock_s, measured_m, leveled_by)
 
 
-def wrong_height(
+def height_words(
     observations: Observations,
     cameras: Mapping[str, CameraCalibration],
     *,
@@ -204,17 +199,30 @@ def wrong_height(
     reference: str,
 ) -> str | None:
     """Words on a raised ball that was seen decimetres from the height that was told; None where all
-    are right, or too little was seen so far to know."""
-    try:
-        balls = without_gaps(observations.balls)
-        seen = sorted_detections(balls, list(cameras), radius_m, held=False)
-        pairs = estimate_pairs({name: own.track for name, own in seen.items()})
-        poses = chain_poses(pairs, reference, list(cameras))
-        refusals.check_connected(cameras, poses)
-        problem = _problem(observations, cameras, seen, poses, radius_m, reference)
-    except CalibrationError:
-        return None
-    return refusals.wrong_height(problem, first_state(problem, poses))
+    are right, or where nothing can be solved from what was seen so far."""
+    observations = replace(observations, balls=without_gaps(observations.balls))
+    with threadpool_limits(limits=1, user_api="blas"):
+        try:
+            problem, poses = _first_problem(observations, cameras, radius_m, reference)
+        except CalibrationError:
+            return None
+        return refusals.height_words(problem, first_state(problem, poses))
+
+
+def _first_problem(
+    observations: Observations,
+    cameras: Mapping[str, CameraCalibration],
+    radius_m: float,
+    reference: str,
+) -> tuple[Problem, Mapping[str, Array]]:
+    """The problem with the widest priors, and first poses of the cameras."""
+    # Balls that are partly covered are good enough for first poses, and to tell what is a ball.
+    seen = sorted_detections(observations.balls, list(cameras), radius_m, held=False)
+    pairs = estimate_pairs({name: own.track for name, own in seen.items()})
+    refusals.check_pairs(seen, pairs)
+    poses = chain_poses(pairs, reference, list(cameras))
+    refusals.check_connected(cameras, poses)
+    return _problem(observations, cameras, seen, poses, radius_m, reference), poses
 
 
 def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem, State]:
@@ -245,12 +253,12 @@ def _advice(
         weak.append(f"for heights, {refusals.remedy(stood, refusals.STAND_WORDS)}")
     elif not stood:
         weak.append(f"for heights, {refusals.STAND_WORDS}")
-    if any(at.startswith(HANGING) for at in problem.heights_m) and plumb_ends(problem) is None:
-        weak.append(f"to know what is vertical, {refusals.HANGING_WORDS}")
     if not _boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")
-    if world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD:
-        weak.append(f"for the floor's slope, {refusals.slope_words(problem)}")
+    if any(at.startswith(HANGING) for at in problem.heights_m) and plumb_ends(problem) is None:
+        weak.append(f"to know what is vertical, {refusals.HANGING_WORDS}")
+    elif world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD and (words := refusals.slope_words(problem)):
+        weak.append(f"for the floor's slope, {words}")
     return tuple(weak)
 
 
