@@ -17,6 +17,7 @@ from functools import partial
 from typing import TypeVar
 
 from station.booth.collection import LATE, Collection, Order
+from station.calibration.drift.motion import CameraMove, depths_words
 from station.calibration.drift.watch import DriftWatch
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.config import BoothConfig
@@ -194,7 +195,7 @@ class ScanWriter:
         Raises:
             CalibrationError: naming the cameras that moved.
         """
-        moved = []
+        moved: list[CameraMove] = []
         for name in self._names:
             for move in self._drift.moves(
                 collection.rig.cameras[name],
@@ -202,13 +203,15 @@ class ScanWriter:
                 collection.sets[0].frames[name].header.depth_scale_m,
             ):
                 if self._drift.confirmed(move):
-                    moved.append(move.words())
+                    moved.append(move)
                 elif move.moved:
                     self._log.warning("the next scan decides: %s", move.words())
+        if len(moved) == len(self._names) and (words := depths_words(moved)):
+            raise CalibrationError(words)
         if moved:
             raise CalibrationError(
-                f"{'; '.join(moved)}; put the camera back and run station check, or run station "
-                "calibrate"
+                f"{'; '.join(move.words() for move in moved)}; put the camera back and run station "
+                "check, or run station calibrate"
             )
 
     def _failed(self, order: Order, reason: str) -> None:

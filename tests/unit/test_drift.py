@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift.estimate import estimate_move
-from station.calibration.drift.motion import LEVER_M, CameraMove
+from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
 from station.calibration.drift.reference import DriftReference, plane_slopes
 from station.core.errors import FormatError
 from station.core.geometry import se3_exp
@@ -248,3 +248,25 @@ def test_a_view_that_no_camera_has_is_named(tmp_path: Path, change: dict[str, np
     np.savez(path, **content)
     with pytest.raises(FormatError, match=r"back-upper\.npz cannot be read"):
         StaticView.load(path)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_depths_that_changed_everywhere_are_no_moved_cameras(sign: float) -> None:
+    """Sensors at another temperature were four cameras to be put back. Estimates of a booth whose
+    depths are 0.3 % too large."""
+    sure = 1e-4**2 * np.eye(6)
+    shifts_mm = [(4.1, -1.1, -8.7), (1.9, -4.8, -10.5), (-3.6, -1.2, -10.4), (-2.5, -3.7, -10.3)]
+    moves = [
+        CameraMove(name, 1e-3 * sign * np.array([0.0, 0.0, 0.0, *shift]), sure, 1.0)
+        for name, shift in zip("abcd", shifts_mm, strict=True)
+    ]
+    words = depths_words(moves)
+    assert words is not None
+    assert ("farther away" if sign > 0.0 else "nearer") in words
+    still = CameraMove("e", np.zeros(6), sure, 1.0)
+    assert depths_words([*moves, still]) is None
+    assert depths_words(moves[:1]) is None
+    aside = replace(moves[0], xi=1e-3 * np.array([0.0, 0.0, 0.0, 9.0, 0.0, -5.0]))
+    assert depths_words([aside, *moves[1:]]) is None
+    opposite = replace(moves[0], xi=-moves[0].xi)
+    assert depths_words([opposite, *moves[1:]]) is None

@@ -12,7 +12,7 @@ import numpy as np
 
 from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.kept import use_correction
-from station.calibration.drift.motion import CameraMove, move_words
+from station.calibration.drift.motion import CameraMove, depths_words, move_words
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
@@ -116,6 +116,8 @@ def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) ->
                 f"  this view cannot detect a small {', '.join(move.unseen_words())}; "
                 "a fixed post or corner in its view would make it possible"
             )
+    if words := depths_words(moves):
+        click.echo(words)
     if changed:
         most = min(changed, key=lambda move: move.share)
         percent = 100.0 * (1.0 - most.share)

@@ -7,6 +7,7 @@ these are named instead of judged.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,9 @@ _UNSEEN = (
     "tilt up or down", "turn to the left or right", "roll", "shift sideways", "shift up or down",
     "shift forward or back",
 )  # fmt: skip
+_ALONG = 0.8
+"""Least share of a shift that is along the camera's axis where depths changed: of depths that changed
+by 0.3 %, 0.86 to 0.95 is."""
 _OBLIQUE = 0.85
 """A direction with a smaller largest component is named by its two largest."""
 
@@ -180,6 +184,26 @@ class CameraMove:
 def _in_metres(covariance: Array) -> Array:
     """A covariance (6, 6) of rotations times LEVER_M and shifts, m^2."""
     return np.asarray(covariance * np.outer(_SCALE, _SCALE))
+
+
+def depths_words(moves: Sequence[CameraMove]) -> str | None:
+    """Words on a change of all sensors' depths, which looks like cameras that all moved forward, or
+    all back; None where it is none.
+
+    A Kinect's depths change with its temperature, by the same share everywhere.
+    """
+    shifts_m = np.array([move.xi[3:] for move in moves if move.moved])
+    if len(shifts_m) < max(len(moves), 2):
+        return None
+    along_m = shifts_m[:, 2]
+    ahead = np.abs(along_m) > _ALONG * np.linalg.norm(shifts_m, axis=1)
+    if not ahead.all() or np.any(np.sign(along_m) != np.sign(along_m[0])):
+        return None
+    return (
+        f"all cameras see everything {'nearer' if along_m[0] > 0.0 else 'farther away'} than when "
+        "they were calibrated, as sensors do that are colder or warmer: let them warm up for 20 "
+        "minutes, and scan again; if they say the same, run station calibrate"
+    )
 
 
 def move_words(xi: Array) -> str:

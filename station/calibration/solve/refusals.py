@@ -193,8 +193,12 @@ def check_scatter(state: State) -> None:
             )
 
 
+def converged(state: State, largest_step: float = CONVERGED) -> bool:
+    return state.last_step < largest_step
+
+
 def check_converged(state: State, largest_step: float = CONVERGED) -> None:
-    if not state.last_step < largest_step:
+    if not converged(state, largest_step):
         raise CalibrationError(
             "the cameras do not agree on where the ball was: a head or another round object may "
             "have been taken for the ball; remove it, make sure that no camera moves, and wave the "

@@ -234,8 +234,12 @@ def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem,
         problem = replace(problem, widths=most_probable_widths(training, tested))
         start = extended_state(problem, training, tested)
         state = solve_joint(problem, start, _FINE_ITERATIONS)
+        averaged = averaged_state(problem, state)
+        if not refusals.converged(state):
+            # A wrong height may be what does not let it settle.
+            refusals.check_doubts(problem, averaged)
         refusals.check_converged(state)
-        return problem, averaged_state(problem, state)
+        return problem, averaged
     except np.linalg.LinAlgError:
         # Equations without a solution come from detections that contradict one another.
         refusals.check_converged(replace(tested, last_step=np.inf))
