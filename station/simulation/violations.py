@@ -186,9 +186,11 @@ def bow_m(switches: frozenset[str], seed: int, x: Array, y: Array) -> Array:
     return height_m + float(rng.choice([-1.0, 1.0])) * _BOW_M * (shape + 0.15 * across**2)
 
 
-_HOOK_M, _BALANCE_M = 1.5e-3, 1.5e-3
-"""Largest shift of the string along its hook from one height to another, and distance of a ball's
-middle from where its weight hangs, in a direction that turns with the string."""
+_ALONG_HOOK_M, _ACROSS_HOOK_M = 2e-3, 5e-4
+"""Largest shifts of the string on its hook, a bent wire, from one height to another."""
+_BALANCE_M = 7e-4
+"""Standard deviation of a ball's middle from where its weight hangs, along each axis; the direction
+turns with the string."""
 _HOOK_HEIGHTS_M, _SWINGS_M = (2.2, 3.0), (5e-4, 8e-3)
 """Ends of the hook's height, and of the amplitude with which a hanging ball still swings."""
 _GRAVITY_M_S2 = 9.81
@@ -198,11 +200,20 @@ def hung_m(seed: int, stated_mm: int, height_m: float, time_s: float) -> Array:
     """x, y (2,) of a ball's centre from below the hook on which it hangs."""
     once, rng = _rng(seed, 10), _rng(seed, 8, stated_mm)
     string_m = once.uniform(*_HOOK_HEIGHTS_M) - height_m
-    shift = rng.uniform(-_HOOK_M, _HOOK_M, 2)
+    wire, off_m = once.uniform(0.0, 2.0 * np.pi), once.normal(0.0, _BALANCE_M, 2)
+    slid_m = rng.uniform(-1.0, 1.0, 2) * (_ALONG_HOOK_M, _ACROSS_HOOK_M)
     turn, phase, twist = rng.uniform(0.0, 2.0 * np.pi, 3)
-    swing = rng.uniform(*_SWINGS_M) * np.sin(np.sqrt(_GRAVITY_M_S2 / string_m) * time_s + phase)
-    shift += once.uniform(0.0, _BALANCE_M) * np.array([np.cos(twist), np.sin(twist)])
-    return np.asarray(shift + swing * np.array([np.cos(turn), np.sin(turn)]))
+    # A swing is an ellipse: the ball was let go with a push to one side.
+    wave = np.sqrt(_GRAVITY_M_S2 / string_m) * time_s + phase
+    ellipse = np.array([np.sin(wave), rng.uniform(-0.5, 0.5) * np.cos(wave)])
+    swing_m = rng.uniform(*_SWINGS_M) * ellipse
+    return np.asarray(_turned(wire) @ slid_m + _turned(twist) @ off_m + _turned(turn) @ swing_m)
+
+
+def _turned(angle_rad: float) -> Array:
+    """Rotation (2, 2) about the vertical."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 _ZERO_PLANE_M, _PIXEL_MM, _EMITTER_CM = 1.2, 0.1042, 7.5

@@ -27,8 +27,8 @@ TAPE_M = 0.001
 """Standard deviation of a height that was measured with a tape."""
 PLUMB_M = 0.0015
 """Standard deviation, along each horizontal axis, of a ball's places above one another that hangs
-from one hook at two heights: the string lies otherwise on the hook, and the ball, whose middle need
-not hang below its knot, has turned."""
+from one hook at two heights: the string lies a millimetre or two elsewhere on the hook, and the
+ball, whose middle is a millimetre from below its knot where its wall is uneven, has turned."""
 PLUMB = "plumb"
 """Name of the plumb line among the places."""
 _TAIL = 4.0

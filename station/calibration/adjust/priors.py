@@ -17,9 +17,11 @@ from station.calibration.adjust.widths import BOW, BOW_TOLERANCE, RADIUS, sigma
 
 Array = NDArray[np.float64]
 
-_FLOOR_SLOPE = 3e-3
-"""Standard deviation of a whole floor's slope along each axis. Levelness numbers F_L of 13 to 25,
-those of ordinary floors (ASTM E1155), are slopes of 4 to 8 mm per metre that 95 % keep."""
+FLOOR_SLOPE_RAD = 3e-3
+"""Standard deviation of a whole floor's slope along each axis. The levelness number F_L (ASTM
+E1155) is 12.5 over three standard deviations of the rise, in inches, across 10 feet: ordinary
+floors, of F_L 13 to 25, slope by 1.4 to 2.7 mm per metre (one standard deviation), others by more.
+"""
 _CONSTANT_SHAPE = 0.5
 """Share of the variance of a ball's shape that stays while it is waved."""
 CLOCK_TOLERANCE_S = 0.005
@@ -69,7 +71,7 @@ def slope_sigma(problem: Problem) -> Array:
     """
     slopes = np.zeros(BOW_SIZE)
     if plumb_ends(problem) is not None:
-        slopes[:2] = _FLOOR_SLOPE
+        slopes[:2] = FLOOR_SLOPE_RAD
     return slopes
 
 

@@ -60,8 +60,8 @@ _UNSEEN = (
     "shift forward or back",
 )  # fmt: skip
 _ALONG = 0.8
-"""Least share of a shift that is along the camera's axis where depths changed: of depths that changed
-by 0.3 %, 0.86 to 0.95 is."""
+"""Least share of a shift that is along the camera's axis where depths changed: it is 0.86 to 0.95
+where they changed by 0.3 %."""
 _OBLIQUE = 0.85
 """A direction with a smaller largest component is named by its two largest."""
 

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.adjust.contacts import plumb_ends
+from station.calibration.adjust.priors import FLOOR_SLOPE_RAD
 from station.calibration.adjust.problem import Layout, Problem, State
 from station.calibration.adjust.sensor_model import LENS, POLYNOMIAL, SensorModel, image_place
 from station.calibration.solve.world import WorldPoses
@@ -68,13 +70,15 @@ def predict_errors(
     crown = seen(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]))[0][0]
     whole = _not_rigid(np.concatenate(every), np.concatenate(rigid))
     rings = [whole[np.array(ring_of) == height_m] for height_m in _RINGS_M.values()]
+    # Where nothing hung, the floor counts as level.
+    unknown_rad = FLOOR_SLOPE_RAD if plumb_ends(problem) is None else 0.0
     girths = [sigma(2.0 * np.pi * rows.mean(axis=0)) for rows in rings]
     variance = np.einsum("ni,ij,nj->n", whole, state.covariance, whole, optimize=True)
     return PredictedError(
         height_sigma_m=sigma(crown),
         girth_sigma_m=max(girths),
         normal_rms_m=float(np.sqrt(variance.mean())),
-        tilt_sigma_rad=world_poses.slope_sigma_rad,
+        tilt_sigma_rad=float(np.hypot(world_poses.slope_sigma_rad, unknown_rad)),
     )
 
 
