@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
@@ -32,7 +33,12 @@ _WORDS = {
 
 @click.command("list")
 @config_option
-@click.option("--since", default="", help="from this day or time on (2026-11-21, UTC)")
+@click.option(
+    "--since",
+    default="",
+    callback=lambda _, __, given: _moment(given),
+    help="from this day or time on (2026-11-21, UTC)",
+)
 @_limit_option
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
 def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
@@ -70,9 +76,25 @@ def _show(config_path: Path | None, text: str, since: str, limit: int, as_json: 
         click.echo(json.dumps([{**asdict(scan), "verdict": scan.verdict} for scan in found]))
         return
     if not found:
-        click.echo(f"no scan matches {text!r}" if text else "no scans yet")
+        since_then = f"no scans since {since}" if since else "no scans yet"
+        click.echo(f"no scan matches {text!r}" if text else since_then)
     for scan in found:
         click.echo(_line(scan))
+
+
+def _moment(given: str) -> str:
+    """A day or time as scans have it: UTC, ISO 8601."""
+    if not given:
+        return ""
+    try:
+        moment = datetime.fromisoformat(given)
+    except ValueError:
+        raise click.BadParameter(
+            f"{given} is no day or time: write 2026-11-21, or 2026-11-21T10:00 (UTC)"
+        ) from None
+    if moment.tzinfo is not None:
+        moment = moment.astimezone(UTC)
+    return moment.strftime("%Y-%m-%dT%H:%M:%S")
 
 
 def _line(scan: ScanRecord) -> str:

@@ -77,7 +77,7 @@ def token() -> None:
 )  # fmt: skip
 @click.option(
     "--days",
-    type=Number(0.0, 36500.0, min_open=True),
+    type=Number(0.0, 36500.0, min_open=True, unit="days"),
     help="the token expires after this many days",
 )
 @config_option

@@ -38,22 +38,27 @@ class Number(click.FloatRange):
         self, low: float | None = None, high: float | None = None, *, unit: str = "", **kwargs: bool
     ) -> None:
         super().__init__(low, high, **kwargs)
-        self._unit = f", in {unit}" if unit else ""
+        self._unit = f" {unit}" if unit else ""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         try:
-            number = float(super().convert(value, param, ctx))
-        except click.BadParameter:
+            number = float(value)
+        except ValueError:
             number = math.nan
         if not math.isfinite(number):
             point = " (write a point, 1.8)" if "," in str(value) else ""
-            self.fail(f"{value} is not a number{self._range()}{self._unit}{point}.", param, ctx)
-        return number
+            self.fail(f"{value} is not a number {self._range()}{point}.", param, ctx)
+        try:
+            return float(super().convert(number, param, ctx))
+        except click.BadParameter:
+            raise click.BadParameter(f"{value} is not {self._range()}.", ctx, param) from None
 
     def _range(self) -> str:
-        return "" if self.min is None and self.max is None else f" {self._describe_range()}"
+        low = "" if self.min is None else f"{'above' if self.min_open else 'from'} {self.min:g}"
+        high = "or more" if self.max is None else f"up to {self.max:g}"
+        return f"{low} {high}{self._unit}"
 
 
 class LazyGroup(click.Group):

@@ -72,7 +72,7 @@ _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
 @click.option(
     "--calibration",
     "waving_s",
-    type=Number(1.0, 600.0),
+    type=Number(10.0, 600.0, unit="seconds"),
     help="also record a calibration, the ball waved for so many seconds; sensors then have depth "
     "errors of their own, and no calibration.json is written",
 )

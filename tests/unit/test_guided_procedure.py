@@ -47,6 +47,7 @@ def guided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Procedure, 
         yield None, session
 
     monkeypatch.setattr(Procedure, "_feed", no_feed)
+    monkeypatch.setattr(Procedure, "_check_station", lambda _: None)
     monkeypatch.setattr(
         procedure, "look_at_wall", lambda _, own, __, place: own.record_wall(f"wall-{place}", [])
     )
@@ -196,7 +197,7 @@ def test_heights_are_shown_again_where_that_is_wanted(
     assert len(_raise(guided, monkeypatch, [1.8, 0.7], again=True)) == 2
     assert session.raised == ["hanging-1800", "hanging-700"]
     said = capsys.readouterr().out
-    assert "this replaces what was seen before: hanging-1900, hanging-600" in said
+    assert "this replaces the ball that was seen at 0.6 and 1.9 m" in said
     assert Session.load(session.folder).raised == session.raised
     assert seconds
 

@@ -51,7 +51,6 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return _called(command, args, kwargs, config_path, recordings, yes)
         except (KeyboardInterrupt, click.Abort):
-            click.echo("  stopped; what was seen is kept: station calibrate goes on from here")
             raise SystemExit(_INTERRUPTED) from None
 
     return wrapped
@@ -80,6 +79,11 @@ def _called(
     try:
         with store.locked():
             return command(procedure, *args, **kwargs)
+    except (KeyboardInterrupt, click.Abort):
+        kept = "what was seen is kept: station calibrate goes on from here"
+        seen = procedure.unfinished_session()
+        click.echo(f"  stopped; {kept if seen else 'nothing was recorded'}")
+        raise
     finally:
         guide.end_line()
 

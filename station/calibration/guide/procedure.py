@@ -27,6 +27,7 @@ from station.calibration.detect.detections import (
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.heights import (
     HOOK,
+    listed_heights,
     measured_height,
     out_of_sight,
     recorded_heights,
@@ -45,6 +46,8 @@ from station.calibration.guide.steps import (
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
+from station.messaging.messages import Request
+from station.messaging.transport import ask_again
 
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
 _SENSORS_S = 20.0
@@ -160,12 +163,14 @@ class Procedure:
 
     def empty(self) -> None:
         """The empty booth and its floor."""
+        self._check_station()
         self.guide.step("Empty booth", "Leave the booth empty; nobody in sight of the cameras.")
         with self._feed(EMPTY) as (feed, session):
             look_at_empty_booth(feed, session, self.guide)
 
     def ball(self, *, again: bool = False) -> None:
         """The ball, waved; ``again``: instead of what was seen of it before."""
+        self._check_station()
         wanted = self.config.calibrate
         self.guide.step(
             "Ball",
@@ -223,6 +228,7 @@ class Procedure:
         complete = any(len(own) >= len(HEIGHTS_M[kind]) for kind, own in seen.items())
         if complete or not self.guide.attended:
             return
+        self._check_station()
         self.guide.title("Ball at two heights")
         begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
         kind = begun or kind
@@ -265,6 +271,7 @@ class Procedure:
         """
         if not RAISED_M[0] <= height_m <= RAISED_M[1]:
             raise CalibrationError(out_of_sight(height_m))
+        self._check_station()
         if kind == HANGING:
             where = f"hanging above the mark, its underside {height_m:g} m above the floor"
             instruction = "Wait until it hangs still, and step back."
@@ -287,9 +294,8 @@ class Procedure:
         session.record_resting(step, balls)
         if again and (others := [place for place in session.raised if place != step]):
             session.forget_raised(others)
-        gone = [place for place in before if place not in session.raised]
-        if gone:
-            self.guide.say(f"this replaces what was seen before: {', '.join(gone)}")
+        if gone := set(before) - set(session.raised):
+            self.guide.say(f"this replaces the ball that was seen at {listed_heights(gone)} m")
         return None
 
     def _ask_for_the_other(self) -> None:
@@ -311,6 +317,7 @@ class Procedure:
         session = self._session_to_add_to()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
+        self._check_station()
         live = self.recordings is None
         before = session.wall_count if live else 0
         for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
@@ -375,6 +382,7 @@ class Procedure:
         self.guide.done(f"calibration {entry.name} is in use ({entry.folder})")
 
     def _lay(self, step: str, title: str, instruction: str) -> None:
+        self._check_station()
         self.guide.step(title, instruction, lays=True)
         session, balls = self._see_at_rest(step)
         session.record_resting(step, balls)
@@ -383,6 +391,12 @@ class Procedure:
         with self._feed(step) as (feed, session):
             self._remark_on_ghosts(session)
             return session, rest_ball(feed, session, self.guide, step)
+
+    def _check_station(self) -> None:
+        """Refuse before anybody has put something up, rather than after a countdown."""
+        if self.guide.attended:
+            runtime = self.config.runtime
+            ask_again(runtime.folder, "control", Request("status"), runtime.command_timeout_s)
 
     def _remark_on_ghosts(self, session: Session) -> None:
         if not session.done(EMPTY):

@@ -37,6 +37,8 @@ _LEAST_WAVED = 0.25
 """Share of the whole time for which the ball is waved once more."""
 _WRITE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
+_MANY_WAIT = 60
+"""Frames, of all cameras, after which what is said of the coverage lags by more than a second."""
 _OFTEN = 0.9
 _MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
@@ -142,6 +144,8 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
     least_s = _SHORTEST_S if feed.replays else LOOK_S
     still = _at_rest(recent, least_s if hangs else None)
     if not still:
+        if feed.replays and feed.missed:
+            raise CalibrationError(_too_slow(feed))
         seen_s = f" for {least_s:g} s" if hangs else ""
         raise CalibrationError(
             f"no camera sees the ball at rest{seen_s}: put it where a camera sees it (one on the "
@@ -231,7 +235,7 @@ def wave_ball(
                     write()
                     written_s = now_s
                 left_s = lasts_s - (now_s - began_s)
-                guide.progress(_wave_line(coverage, left_s))
+                guide.progress(_wave_line(coverage, left_s, finder.waiting))
                 if not feed.replays and left_s < (0.0 if coverage.enough else -lasts_s):
                     break
             while finder.waiting:
@@ -243,7 +247,7 @@ def wave_ball(
         finally:
             write()
     if feed.replays and feed.missed:
-        guide.say(f"this machine is too slow for the replay: {feed.missed} frames were missed")
+        guide.say(_too_slow(feed))
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
@@ -252,9 +256,14 @@ def wave_ball(
         guide.say(f"more positions would help: {coverage.advice()}")
 
 
-def _wave_line(coverage: Coverage, left_s: float) -> str:
+def _too_slow(feed: Feed) -> str:
+    return f"this machine is too slow for the replay: {feed.missed} frames were missed"
+
+
+def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
-    return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}"
+    behind = f" ({waiting} frames are still to be looked at)" if waiting > _MANY_WAIT else ""
+    return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
 
 
 def _background(session: Session, camera: str) -> Image | None:

@@ -15,8 +15,6 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import (
     AROUND,
     FRONT,
-    HANGING,
-    HEIGHTS_M,
     MARK,
     BallDetection,
     Observations,
@@ -62,8 +60,7 @@ STAND_WORDS = (
 )
 HANGING_WORDS = (
     "hang the ball from one and the same hook at two heights, and let it come to rest (station "
-    f"calibrate stand --hanging --height {HEIGHTS_M[HANGING][0]:g}, then --height "
-    f"{HEIGHTS_M[HANGING][1]:g})"
+    "calibrate stand --hanging)"
 )
 _HANG_ANEW = (
     f"{HANGING_WORDS}; if it did hang so, something lay under the ball on the floor, or the floor "
