@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from station.core.errors import InputError
 from workers.cloud.floor import UNITS_M, Z_UP, check_units, standing_on
 from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
+from workers.cloud.pcd import check_pcd
 from workers.cloud.ply import read_points, read_triangles
 
 Array = NDArray[np.float64]
@@ -123,16 +124,15 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
 
 def _read(path: Path) -> o3d.geometry.PointCloud:
     """The cloud of a file as it stands there; an empty one where there is none."""
-    if path.suffix.lower() != ".ply":
-        # Open3D's warnings would repeat the error that is raised.
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            try:
-                return o3d.io.read_point_cloud(path)
-            except MemoryError:
-                raise InputError(
-                    f"{path} claims more points than memory holds; repair it, or give a .ply"
-                ) from None
     try:
+        if path.suffix.lower() == ".pcd":
+            check_pcd(path)
+            # Open3D's warnings would repeat the error that is raised.
+            with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+                return o3d.io.read_point_cloud(path)
+        # No other format: Open3D fills what a torn .pts lacks with whatever memory holds.
+        if path.suffix.lower() != ".ply":
+            raise ValueError(f"files that end in {path.suffix!a:.20} are not read")
         points, normals = read_points(path)
     except (OSError, ValueError) as cause:
         raise InputError(
