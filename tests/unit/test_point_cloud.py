@@ -102,6 +102,15 @@ def test_normals_that_are_no_directions_are_estimated(tmp_path: Path, length: fl
     assert np.abs(normals[:, 2]).mean() < 0.3
 
 
+def test_a_point_that_is_repeated_counts_once(tmp_path: Path) -> None:
+    """40 000 points in one place took 13 s, 250 000 ten minutes."""
+    person = _person(np.random.default_rng(2))
+    points = np.concatenate([person, np.tile(person[:1], (250_000 - len(person), 1))])
+    assert len(read_cloud(_written(tmp_path / "a.ply", points), "z")) == len(person)
+    with pytest.raises(InputError, match="has 1 different points; a body needs"):
+        read_cloud(_written(tmp_path / "b.ply", points[-40_000:]), "z")
+
+
 def test_a_cloud_in_millimetres_is_read_as_such(tmp_path: Path) -> None:
     points = _person(np.random.default_rng(2))
     path = _written(tmp_path / "a.ply", 1000.0 * points)

@@ -109,8 +109,6 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
     points = np.asarray(cloud.points)
     if not len(points):
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
-    if len(points) < MIN_POINTS:
-        raise InputError(f"{path} has {len(points)} points; a body needs {MIN_POINTS}")
     if broken := int((~np.isfinite(points)).any(axis=1).sum()):
         raise InputError(
             f"{broken} of the {len(points)} points of {path} are not numbers (NaN or infinite); "
@@ -119,6 +117,12 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
     if len(points) > _MAX_POINTS:
         kept = np.random.default_rng(len(points)).permutation(len(points))[:_MAX_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
+    # The search for a point's neighbours takes as long as there are points where it lies.
+    cloud = cloud.remove_duplicated_points()
+    if len(cloud.points) < MIN_POINTS:
+        raise InputError(
+            f"{path} has {len(cloud.points)} different points; a body needs {MIN_POINTS}"
+        )
     return cloud
 
 
