@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from isal import isal_zlib
@@ -21,6 +23,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 JUMP_RATIO = 0.02
 """Neighbouring readings of one surface differ by less than this share of their depth a pixel."""
+_MAX_CONTROL_POINTS = 64
+"""Along an axis of a depth field; the solution uses less than twenty."""
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_START = _PNG_SIGNATURE + b"\0\0\0\x0dIHDR"
 """The first chunk of 13 bytes begins every file."""
@@ -82,6 +86,29 @@ class DepthField:
     """(k,) inverse depths, 1/m, increasing; at least two."""
     control: Array
     """(k, j, i), 1/m."""
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> DepthField:
+        """The field of a camera's depth_correction in calibration.json.
+
+        Raises:
+            KeyError: a key is missing.
+            ValueError: it is no field of finite numbers, or has too many.
+        """
+        knots = np.asarray(fields["inverse_depth_per_m"], np.float64)
+        control = np.asarray(fields["control_per_m"], np.float64)
+        if (
+            control.ndim != 3
+            or knots.shape != control.shape[:1]
+            or min(control.shape) < 2
+            or min(control.shape[1:]) < 3
+            or max(control.shape) > _MAX_CONTROL_POINTS
+            or not np.isfinite(control).all()
+            or not np.isfinite(knots).all()
+            or not (np.diff(knots) > 0.0).all()
+        ):
+            raise ValueError("the field of depth_correction is not usable")
+        return cls(tuple(float(knot) for knot in knots), control)
 
     def at(self, inverse: Array, x: Array, y: Array) -> Array:
         """Values (n,) at inverse depths and image positions (n,)."""

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+_RIGID_TOLERANCE = 1e-4
+
 
 def skew(vector: ArrayLike) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
@@ -77,6 +79,16 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return np.asarray(u @ vt)
+
+
+def is_rigid(matrix: Array) -> bool:
+    """Whether a matrix (4, 4) is a rigid transform, but for rounding to a few digits."""
+    rotation = matrix[:3, :3]
+    return bool(
+        np.abs(rotation @ rotation.T - np.eye(3)).max() <= _RIGID_TOLERANCE
+        and np.linalg.det(rotation) > 0
+        and np.abs(matrix[3] - (0, 0, 0, 1)).max() <= _RIGID_TOLERANCE
+    )
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:

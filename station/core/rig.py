@@ -16,16 +16,26 @@ from numpy.typing import NDArray
 from station.core.depth_image import DepthField
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
+from station.core.geometry import is_rigid
 
 FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
 MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
-_MAX_CONTROL_POINTS = 64
-"""Along an axis of a depth field; the solution uses less than twenty."""
 POLYNOMIAL, FIELD = "inverse-depth-poly", "inverse-depth-field"
 """Models of depth correction, beside "none"."""
-_ROTATION_TOLERANCE = 1e-4
+_MAX_COEFFICIENTS = 16
+"""The solution uses five; powers beyond cannot be told from rounding."""
+_ZERO = 1e-6
+"""Largest size of what is 0 in K but for rounding."""
+_FOCAL_RATIO = 3.0
+"""Pixels that were merged along one side of the image are twice as long as wide."""
+_MAX_DISTORTION = 1e3
+_FARTHEST_M = 100.0
+"""A booth is a room."""
+_LARGEST_ERROR_M, _LARGEST_ERROR_RAD = 1.0, float(np.pi)
+_DEPTHS_M = np.linspace(0.5, 4.0, 36)
+"""At which a correction must leave readings: a booth's."""
 
 Array = NDArray[np.float64]
 
@@ -117,8 +127,10 @@ class PredictedError:
     def from_json(cls, fields: Mapping[str, Any]) -> PredictedError:
         names = ("height_sigma_m", "girth_sigma_m", "normal_rms_m", "tilt_sigma_rad")
         values = [float(fields[name]) for name in names]
-        if not all(np.isfinite(value) and value >= 0.0 for value in values):
-            raise ValueError("predicted must be finite and not negative")
+        for name, value in zip(names, values, strict=True):
+            most = _LARGEST_ERROR_RAD if name.endswith("rad") else _LARGEST_ERROR_M
+            if not 0.0 <= value <= most:
+                raise ValueError(f"predicted: {name} must lie between 0 and {most:.4g}")
         return cls(*values)
 
 
@@ -224,48 +236,77 @@ class Rig:
                     else None
                 ),
             )
+            rig._check()
         except KeyError as missing:
             raise FormatError(f"{path}: the field {missing} is missing; calibrate again") from None
         except (ValueError, TypeError, AttributeError, OverflowError) as cause:
             raise FormatError(f"{path}: {cause}; calibrate again") from None
-        if not rig.cameras:
-            raise FormatError(f"{path}: it contains no camera; calibrate again")
         return rig
+
+    def _check(self) -> None:
+        if not self.cameras:
+            raise ValueError("it contains no camera")
+        if self.reference not in self.cameras:
+            known = ", ".join(self.cameras)
+            raise ValueError(f"reference {self.reference!a:.80} is none of its cameras ({known})")
+        if not 0.0 <= self.residual_rms_m < np.inf:
+            raise ValueError("residual_rms_m must be finite and not negative")
+
+
+def _expect(met: bool | np.bool_, camera: str, words: str) -> None:
+    if not met:
+        raise ValueError(f"camera {camera}: {words}")
 
 
 def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
     def matrix(key: str, shape: tuple[int, ...]) -> Array:
         values = np.asarray(fields[key], dtype=np.float64)
-        if values.shape != shape or not np.isfinite(values).all():
-            raise ValueError(f"camera {name}: {key} must be {shape} finite numbers")
+        finite = values.shape == shape and np.isfinite(values).all()
+        _expect(finite, name, f"{key} must be {shape} finite numbers")
         return values
 
+    # Its frames lie in a folder of this name.
+    if name in ("", ".", "..") or set(name) & {"/", "\\"} or not name.isprintable():
+        raise ValueError(f"camera {name!a:.80}: its name must be one of a folder, without / and \\")
     pose = matrix("world_from_camera", (4, 4))
-    rotation = pose[:3, :3]
-    if (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or np.abs(pose[3] - (0, 0, 0, 1)).max() > _ROTATION_TOLERANCE
-    ):
-        raise ValueError(f"camera {name}: world_from_camera is not a rigid transform")
-    K = matrix("K", (3, 3))
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError(f"camera {name}: K must have positive focal lengths")
-    width, height = int(fields["width"]), int(fields["height"])
-    if not (0 < width <= MAX_PIXELS and 0 < height <= MAX_PIXELS):
-        raise ValueError(f"camera {name}: width and height must lie between 1 and {MAX_PIXELS}")
+    _expect(is_rigid(pose), name, "world_from_camera is not a rigid transform")
+    near = (np.abs(pose[:3, 3]) <= _FARTHEST_M).all()
+    _expect(near, name, f"world_from_camera must lie within {_FARTHEST_M:g} m of the mark")
+    sizes = width, height = int(fields["width"]), int(fields["height"])
+    whole = sizes == (fields["width"], fields["height"])
+    possible = whole and 0 < min(sizes) <= max(sizes) <= MAX_PIXELS
+    _expect(possible, name, f"width and height must be whole numbers from 1 to {MAX_PIXELS}")
+    distortion = matrix("distortion", (5,))
+    straight = (np.abs(distortion) <= _MAX_DISTORTION).all()
+    _expect(straight, name, f"distortion must lie within {_MAX_DISTORTION:g} of 0")
     return CameraCalibration(
         name=name,
         serial=str(fields["serial"]),
         model=str(fields["model"]),
         width=width,
         height=height,
-        K=K,
-        distortion=matrix("distortion", (5,)),
+        K=_intrinsics(name, matrix("K", (3, 3)), width, height),
+        distortion=distortion,
         depth_correction=_correction(name, fields["depth_correction"]),
         world_from_camera=pose,
         covariance=_covariance(name, fields, matrix),
     )
+
+
+def _intrinsics(name: str, K: Array, width: int, height: int) -> Array:
+    """K, whose other terms no reader of it looks at, if it is that of a camera of this size."""
+    (fx, _, cx), (_, fy, cy), _ = K
+    others = K - ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
+    near, far = min(fx, fy), max(fx, fy)
+    beside = -width <= cx <= 2 * width and -height <= cy <= 2 * height
+    for met, words in (
+        (near > 1.0, "positive focal lengths, beyond 1 pixel"),
+        (far <= _FOCAL_RATIO * near, f"fx and fy within a factor of {_FOCAL_RATIO:g}"),
+        (beside, "its centre less than an image's size away from the image"),
+        (np.abs(others).max() < _ZERO, "the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+    ):
+        _expect(met, name, f"K must have {words}")
+    return K
 
 
 def _covariance(
@@ -286,34 +327,24 @@ def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
         return DepthCorrection()
     if model in (POLYNOMIAL, FIELD):
         coefficients = tuple(float(value) for value in fields["coefficients"])
-        if not coefficients or not np.isfinite(coefficients).all():
-            raise ValueError(f"camera {name}: depth_correction needs finite coefficients")
-        gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
-        if len(gradient) != 2 or not np.isfinite(gradient).all():
-            raise ValueError(f"camera {name}: image_gradient must be two finite numbers")
-        return DepthCorrection(
-            coefficients,
-            (gradient[0], gradient[1]),
-            _field(name, fields) if model == FIELD else None,
+        usable = 0 < len(coefficients) <= _MAX_COEFFICIENTS and np.isfinite(coefficients).all()
+        _expect(
+            usable, name, f"depth_correction needs 1 to {_MAX_COEFFICIENTS} finite coefficients"
         )
+        gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
+        usable = len(gradient) == 2 and np.isfinite(gradient).all()
+        _expect(usable, name, "image_gradient must be two finite numbers")
+        try:
+            field = DepthField.from_json(fields) if model == FIELD else None
+        except ValueError as cause:
+            raise ValueError(f"camera {name}: {cause}") from None
+        correction = DepthCorrection(coefficients, (gradient[0], gradient[1]), field)
+        edges = np.array([-1.0, 0.0, 1.0])
+        inverse, x, y = (grid.ravel() for grid in np.meshgrid(1.0 / _DEPTHS_M, edges, edges))
+        left = (correction.inverse_at(inverse, x, y) > 0.0).any()
+        _expect(left, name, "depth_correction must leave readings between 0.5 and 4 m")
+        return correction
     raise ValueError(
         f"camera {name}: depth_correction model {model!r} is unknown "
         f"(known: none, {POLYNOMIAL}, {FIELD})"
     )
-
-
-def _field(name: str, fields: Mapping[str, Any]) -> DepthField:
-    knots = np.asarray(fields["inverse_depth_per_m"], np.float64)
-    control = np.asarray(fields["control_per_m"], np.float64)
-    if (
-        control.ndim != 3
-        or knots.shape != control.shape[:1]
-        or min(control.shape) < 2
-        or min(control.shape[1:]) < 3
-        or max(control.shape) > _MAX_CONTROL_POINTS
-        or not np.isfinite(control).all()
-        or not np.isfinite(knots).all()
-        or not (np.diff(knots) > 0.0).all()
-    ):
-        raise ValueError(f"camera {name}: the field of depth_correction is not usable")
-    return DepthField(tuple(float(knot) for knot in knots), control)

@@ -91,6 +91,41 @@ def _set(*keys: str, value: Any) -> Callable[[dict[str, Any]], None]:
 
 
 _CAMERA = ("cameras", "front-upper")
+_PREDICTED = PredictedError(2e-3, 1e-3, 5e-4, 1e-3).to_json()
+_WRONG_K = [
+    (0, 1, 300.0, "K must have the form [[fx, 0, cx]"),
+    (1, 0, 300.0, "K must have the form [[fx, 0, cx]"),
+    (2, 0, 1.0, "K must have the form [[fx, 0, cx]"),
+    (2, 2, 5.0, "K must have the form [[fx, 0, cx]"),
+    (0, 0, 60.0, "fx and fy within a factor of 3"),
+    (1, 1, 1e-9, "beyond 1 pixel"),
+    (0, 2, 1e9, "less than an image's size away"),
+    (1, 2, -481.0, "less than an image's size away"),
+]
+
+
+def _k(row: int, column: int, value: float) -> list[list[float]]:
+    K = make_rig().cameras["front-upper"].K.copy()
+    K[row, column] = value
+    return [[float(number) for number in numbers] for numbers in K]
+
+
+def _afar(distance_m: float) -> list[list[float]]:
+    pose = np.eye(4)
+    pose[1, 3] = distance_m
+    return [[float(number) for number in numbers] for numbers in pose]
+
+
+def _correction(coefficients: list[float]) -> Callable[[dict[str, Any]], None]:
+    return _set(
+        *_CAMERA,
+        "depth_correction",
+        value={"model": "inverse-depth-poly", "coefficients": coefficients},
+    )
+
+
+def _named(name: str) -> Callable[[dict[str, Any]], None]:
+    return lambda document: document["cameras"].update({name: document["cameras"]["front-upper"]})
 
 
 @pytest.mark.parametrize(
@@ -105,6 +140,25 @@ _CAMERA = ("cameras", "front-upper")
         ),
         (_set(*_CAMERA, "depth_correction", value={"model": "spline"}), "'spline' is unknown"),
         (_set(*_CAMERA, "distortion", value=[0, 0, 0, 0, None]), "distortion must be"),
+        *((_set(*_CAMERA, "K", value=_k(i, j, value)), words) for i, j, value, words in _WRONG_K),
+        (_set(*_CAMERA, "distortion", value=[0, 0, 0, 0, -1e4]), "distortion must lie within"),
+        (_set(*_CAMERA, "width", value=640.5), "width and height must be whole numbers"),
+        (_set(*_CAMERA, "height", value="480"), "width and height must be whole numbers"),
+        (_set(*_CAMERA, "world_from_camera", value=_afar(101.0)), "within 100 m"),
+        (_correction([0.0, -1.0]), "must leave readings between 0.5 and 4 m"),
+        (_correction([0.0]), "must leave readings between 0.5 and 4 m"),
+        (_correction([1e-9] * 17), "needs 1 to 16 finite coefficients"),
+        (_correction([]), "needs 1 to 16 finite coefficients"),
+        *(
+            (_named(name), "its name must be one of a folder")
+            for name in ("../x", "", "a\\b", "\n")
+        ),
+        (_set("reference", value="nobody"), "reference 'nobody' is none of its cameras (front"),
+        (_set("residual_rms_m", value=float("nan")), "residual_rms_m must be finite"),
+        (_set("residual_rms_m", value=-1.0), "residual_rms_m must be finite"),
+        (_set("predicted", value={**_PREDICTED, "girth_sigma_m": 2.0}), "girth_sigma_m must lie"),
+        (_set("predicted", value={**_PREDICTED, "tilt_sigma_rad": 4.0}), "tilt_sigma_rad must lie"),
+        (_set("predicted", value={**_PREDICTED, "normal_rms_m": -1.0}), "normal_rms_m must lie"),
         (_set("cameras", value={}), "no camera"),
         (_set("cameras", value=[1]), "calibrate again"),
         (lambda document: document.pop("reference"), "'reference' is missing"),
