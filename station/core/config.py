@@ -297,9 +297,12 @@ def load_config(path: Path) -> BoothConfig:
             f"{path} cannot be read ({cause.strerror}); station setup writes it, --config names "
             "another file"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as cause:
+    except (ValueError, RecursionError) as cause:
+        # Python's own words for the others are advice to programmers.
+        its_own = isinstance(cause, tomllib.TOMLDecodeError | UnicodeDecodeError)
+        said = cause if its_own else "a number or brackets in brackets go on for too long"
         raise ConfigError(
-            f"{path} is not TOML: {cause}; correct it, or station setup --replace writes a new one"
+            f"{path} is not TOML: {said}; correct it, or station setup --replace writes a new one"
         ) from None
     base = {BASE_FOLDER: path.resolve().parent}
     try:

@@ -36,6 +36,11 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         ("", "cameras is missing"),
         ("cameras = 3", "cameras"),
         ("[[cameras]", "is not TOML"),
+        ("a=" + "[" * 5000, "is not TOML: a number or brackets in brackets"),
+        (
+            _CAMERA + "[workers]\ncount = " + "9" * 5000,
+            "is not TOML: a number or brackets in brackets",
+        ),
         (_CAMERA + "colour = true", "unknown key cameras.0.colour; allowed here: name, driver"),
         (_CAMERA + "[sync]\ntolerence_s = 1", "unknown key sync.tolerence_s; allowed here: tol"),
         (_CAMERA + "[sync]\ntolerance_s = -1", "sync.tolerance_s: must be greater than 0"),
