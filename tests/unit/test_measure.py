@@ -26,7 +26,7 @@ from workers.measure.intervals import (
     shipped,
     sides_pooled,
 )
-from workers.measure.kinds import Route, Section
+from workers.measure.kinds import TRUNK_ENDS, Route, Section
 from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
@@ -299,7 +299,15 @@ def test_a_poorly_seen_body_gets_wider_intervals(model: BodyModel) -> None:
     assert widths[1] > 1.1 * widths[0]
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
+    """Two exchanged cameras gave a crushed one, of which numpy complained in the terminal."""
+    crushed = model.mean.copy()
+    neck, crotch = (model.landmarks[name] for name in TRUNK_ENDS)
+    # Skin counts within a share of the distance between them.
+    crushed[neck] = crushed[crotch] + 1e-9
+    with pytest.raises(InputError, match="its landmarks give no direction; fit the body again"):
+        trace_all(model, crushed)
     flat = model.mean * (1.0, 1.0, 0.0)
     with pytest.raises(InputError, match="cannot be measured"):
         trace_all(model, flat)

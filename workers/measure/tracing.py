@@ -121,6 +121,19 @@ class _Tape:
     """Unit normal of the section's plane."""
 
 
+def _unit(vector: Array) -> Array:
+    """A vector at length 1.
+
+    Raises:
+        ValueError: it has no direction: on a body that was fitted to nothing sensible, landmarks
+            coincide, and a trunk that was crushed has no skin within reach of its own landmarks.
+    """
+    length = float(np.linalg.norm(vector))
+    if not length > 0.0:
+        raise ValueError("its landmarks give no direction")
+    return np.asarray(vector / length)
+
+
 class _Tracer:
     def __init__(self, model: BodyModel, vertices: Array) -> None:
         self._model = model
@@ -189,7 +202,7 @@ class _Tracer:
                 return point, line / length
             case Tilted(front, back, side, other):
                 normal = cross(self._at(other) - self._at(side), self._at(back) - self._at(front))
-                return self._at(front), normal / np.linalg.norm(normal)
+                return self._at(front), _unit(normal)
             case Protrusion():
                 return self._farthest(plane), _UP
 
@@ -200,10 +213,9 @@ class _Tracer:
         height = self._vertices[:, 2]
         inside = self._model.of_parts(plane.parts) & (low <= height) & (height <= high)
         candidates = self._vertices[inside]
-        if not len(candidates):
+        if not low < high or not len(candidates):
             raise ValueError("no vertex lies between the two levels")
-        direction = (self._at(plane.end) - self._at(plane.start))[:2]
-        reach = candidates[:, :2] @ (direction / np.linalg.norm(direction))
+        reach = candidates[:, :2] @ _unit((self._at(plane.end) - self._at(plane.start))[:2])
         weight = np.exp((reach - reach.max()) / (PROTRUSION_SHARE * (high - low)))
         return np.asarray(weight @ candidates / weight.sum())
 
@@ -306,8 +318,7 @@ class _Tracer:
             outward = 0.5 * (ends[0] + ends[1]) - self._mean(route.landmarks)
         else:
             outward = self._facing(route, ends[0]) + self._facing(route, ends[1])
-        normal = cross(ends[1] - ends[0], outward)
-        normal /= np.linalg.norm(normal)
+        normal = _unit(cross(ends[1] - ends[0], outward))
         net = _net(self._model, route.parts)
         found, crossing = net.cut(self._vertices, ends[0], normal)
         order: Index = surface_order(
@@ -325,5 +336,4 @@ class _Tracer:
         neck, crotch = (self._at(landmark) for landmark in TRUNK_ENDS)
         reach_m = NORMAL_RADIUS * float(np.linalg.norm(neck - crotch))
         triangles = _triangles(self._model, route.parts)
-        total = around(self._middles, self._area_vectors, triangles, end, reach_m)
-        return np.asarray(total / np.linalg.norm(total))
+        return _unit(around(self._middles, self._area_vectors, triangles, end, reach_m))
