@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -233,11 +234,33 @@ def test_a_damaged_view_is_named(stored: StaticView, tmp_path: Path) -> None:
             StaticView.load(path)
 
 
+def test_a_views_size_is_looked_at_before_it_is_unpacked(
+    stored: StaticView, tmp_path: Path
+) -> None:
+    """A file of 1.3 MB took 1.7 GB."""
+    path = tmp_path / "front-lower.npz"
+    stored.save(path)
+    height, width = stored.noise.shape
+    assert StaticView.load(path, (height, width)).frames == 30
+    with pytest.raises(FormatError, match=r"inverse_depth of \(9, 9\) was expected, not"):
+        StaticView.load(path, (9, 9))
+    with zipfile.ZipFile(path) as archive:
+        content = {name: bytearray(archive.read(name)) for name in archive.namelist()}
+    for name in ("inverse_depth.npy", "readings.npy", "noise.npy", "outline_noise.npy"):
+        large = f"({height}, {width}), }}".encode(), f"(9000, {width}) }}".encode()
+        content[name] = content[name].replace(*large)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+    with pytest.raises(FormatError, match=r"inverse_depth is .9000, .* at most 4096 pixels"):
+        StaticView.load(path)
+
+
 @pytest.mark.parametrize(
     "change",
     [
         {"frames": np.array(0)}, {"frames": np.array(np.inf)}, {"noise": np.full((4, 4), np.nan)},
-        {"inverse_depth": np.zeros(4)}, {"readings": np.zeros((2, 4))},
+        {"inverse_depth": np.zeros(4)}, {"readings": np.zeros((2, 4))}, {"frames": np.full(9, 30)},
         {"outline_noise": np.full((4, 4), "x")},
     ],
 )  # fmt: skip

@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from station.core.depth_image import Image, inverse_depth
 from station.core.errors import FormatError
 from station.core.files import write_bytes
+from station.core.rig import MAX_PIXELS
 
 VERSION = 1
 SMOOTHING_PX = 3.0
@@ -31,6 +33,8 @@ _FEWEST_FRAMES = 2
 """A noise cannot be told from one."""
 _IMAGES = ("inverse_depth", "readings", "noise", "outline_noise")
 """Images of a stored view."""
+_LARGEST_VALUE = 8
+"""Bytes of a pixel."""
 _UNREADABLE = (
     OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, ArithmeticError,
     MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
@@ -73,23 +77,30 @@ class StaticView:
         write_bytes(path, buffer.getvalue())
 
     @classmethod
-    def load(cls, path: Path) -> StaticView:
+    def load(cls, path: Path, size: tuple[int, int] | None = None) -> StaticView:
         """Read a stored view.
 
+        Args:
+            size: (h, w) of the camera's images, where it is known.
+
         Raises:
-            FormatError: naming the file that is missing, torn or of another version.
+            FormatError: naming the file that is missing, torn, of another version or another size.
         """
         try:
             with np.load(path, allow_pickle=False) as archive:
+                _check_shape(archive, "version", ())
                 version = int(archive["version"])
                 if version != VERSION:
                     raise FormatError(
                         f"{path} has version {version}; this program reads {VERSION}; "
                         "run station calibrate floor"
                     )
+                _check_shape(archive, "frames", ())
                 frames = int(archive["frames"])
                 if frames < _FEWEST_FRAMES:
                     raise ValueError(f"it is of {frames} frames")
+                for name in _IMAGES:
+                    _check_shape(archive, name, size)
                 images = [_finite_image(archive[name]) for name in _IMAGES]
                 if len({image.shape for image in images}) > 1:
                     raise ValueError("its images differ in size")
@@ -99,6 +110,22 @@ class StaticView:
             raise FormatError(
                 f"{path} cannot be read ({cause}); run station calibrate floor"
             ) from None
+
+
+def _check_shape(archive: Any, name: str, size: tuple[int, ...] | None) -> None:
+    """Compare an array's shape before it is unpacked: a small file may hold gigabytes.
+
+    Raises:
+        ValueError: it is not the given one, or is no image of a depth camera.
+    """
+    with archive.zip.open(f"{name}.npy") as stream:
+        if np.lib.format.read_magic(stream) != (1, 0):
+            raise ValueError(f"{name} is of another version of numpy's format")
+        shape, _, kind = np.lib.format.read_array_header_1_0(stream)
+    if kind.itemsize > _LARGEST_VALUE or (size is not None and shape != size):
+        raise ValueError(f"{name} of {size or 'numbers'} was expected, not {shape} of {kind}")
+    if size is None and not (len(shape) == 2 and max(shape) <= MAX_PIXELS):
+        raise ValueError(f"{name} is {shape}, no image of at most {MAX_PIXELS} pixels a side")
 
 
 def _finite_image(values: NDArray[np.generic]) -> Image:

@@ -178,8 +178,10 @@ class CalibrationStore:
         """
         for folder in self._folders():
             if self._is_used(folder):
+                cameras = Rig.load(folder / CALIBRATION).cameras
+                sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
                 views = [path for path in entries_of(folder / SCENE) if path.suffix == ".npz"]
-                return {path.stem: StaticView.load(path) for path in views}
+                return {path.stem: StaticView.load(path, sizes.get(path.stem)) for path in views}
         return {}
 
 
