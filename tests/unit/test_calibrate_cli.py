@@ -51,6 +51,23 @@ def _begin(store: CalibrationStore) -> Session:
     return Session.begin(store.unfinished, "2026-11-21T10:00:00Z", 0.1, CAMERAS)
 
 
+def test_a_damaged_calibration_has_a_line_of_its_own(config: Path, store: CalibrationStore) -> None:
+    for day in (1, 2):
+        _begin(store)
+        store.finish(replace(default_rig(), created=f"2026-11-0{day}T10:00:00Z"), {})
+    (store.folder / "20261101T100000Z" / "calibration.json").write_text("{")
+    command = "from station.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", command, "calibrate", "--list", "--config", str(config)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "20261102T100000Z  4 cameras" in done.stdout
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("  20261101T100000Z  cannot be used: ")
+
+
 def test_stored_calibrations_are_listed_and_put_into_use(
     config: Path, store: CalibrationStore
 ) -> None:

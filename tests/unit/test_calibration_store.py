@@ -62,6 +62,17 @@ def test_each_calibration_has_its_folder_and_one_is_in_use(store: CalibrationSto
         store.use("1999")
 
 
+def test_a_damaged_calibration_does_not_hide_the_others(
+    store: CalibrationStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = [_finished(store, day) for day in (1, 2, 3)]
+    (store.folder / names[1] / "calibration.json").write_text("{")
+    assert [entry.name for entry in store.entries()] == [names[0], names[2]]
+    (told,) = caplog.messages
+    assert f"{names[1]}  cannot be used: " in told
+    assert "calibration.json cannot be read as JSON" in told
+
+
 def test_a_calibration_of_the_same_second_is_not_overwritten(store: CalibrationStore) -> None:
     _finished(store, 1)
     Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)

@@ -8,6 +8,7 @@ calibration.json                 a copy of the one in use
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from contextlib import AbstractContextManager
@@ -17,7 +18,7 @@ from typing import Any
 
 from station.calibration.detect.scene import StaticView
 from station.calibration.guide.session import SCENE, SESSION, Session
-from station.core.errors import CalibrationError
+from station.core.errors import CalibrationError, FormatError
 from station.core.files import (
     entries_of,
     fsync_folder,
@@ -30,6 +31,7 @@ from station.core.files import (
 from station.core.rig import Rig
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
+_log = logging.getLogger(__name__)
 _ABANDONED, LOCK = "abandoned-", "calibrate.lock"
 
 
@@ -66,13 +68,17 @@ class CalibrationStore:
         return self.folder / UNFINISHED
 
     def entries(self) -> list[Entry]:
-        """All stored calibrations, oldest first."""
-        if not self.folder.is_dir():
-            return []
-        return [
-            Entry(folder.name, folder, Rig.load(folder / CALIBRATION), self._is_used(folder))
-            for folder in self._folders()
-        ]
+        """All stored calibrations that can be read, oldest first; each other one is a warning."""
+        found = []
+        for folder in self._folders():
+            try:
+                rig = Rig.load(folder / CALIBRATION)
+            except FormatError as cause:
+                # One damaged file must not hide the sound ones.
+                _log.warning("  %s  cannot be used: %s", folder.name, cause)
+                continue
+            found.append(Entry(folder.name, folder, rig, self._is_used(folder)))
+        return found
 
     def name_in_use(self) -> str:
         """Name of the calibration that the booth reads; empty if it is none of the stored ones."""

@@ -212,7 +212,8 @@ def calibrated(folder: Path) -> bool:
     store = CalibrationStore(folder / "calibrations", folder / "calibration.json")
     try:
         Rig.load(store.in_use)
-        store.entries()
+        for path in store.folder.glob(f"*/{store.in_use.name}"):
+            Rig.load(path)
         if (store.unfinished / "session.json").exists():
             Session.load(store.unfinished)
     except FormatError:
