@@ -7,6 +7,7 @@ each a one-line header `P5 640 480 65535` and little-endian 16-bit raw 11-bit di
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Iterable
@@ -17,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.errors import FormatError
-from station.core.kinect_v1 import HEIGHT, WIDTH
+from station.core.kinect_v1 import HEIGHT, TICK_BITS, TICK_HZ, WIDTH
 
 INDEX = "INDEX.txt"
 _HEADER = f"P5 {WIDTH} {HEIGHT} 65535\n".encode()
 _SHAPE = (HEIGHT, WIDTH)
+_HALF_TURN_S = 0.5 * 2**TICK_BITS / TICK_HZ
+"""Within half a turn of the counter no ticks come again; after a whole one they may."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,29 +86,48 @@ def check_recording(folder: Path) -> list[tuple[float, int, Path]]:
     """
     index = folder / INDEX
     try:
-        names = index.read_text().split()
+        lines = index.read_text().splitlines()
     except OSError as cause:
         raise FormatError(
             f"{index} cannot be read ({cause.strerror}); {folder} is not a recording, "
             "make one with: station record-virtual --out FOLDER"
         ) from None
-    frames = []
-    for name in names:
+    except UnicodeDecodeError as cause:
+        raise FormatError(f"{index} is not text ({cause}); record again") from None
+    frames: list[tuple[float, int, Path]] = []
+    known: dict[int, tuple[int, float]] = {}
+    for number, line in enumerate(lines, 1):
+        name, where = line.strip(), f"{index}, line {number}"
         if not name.startswith("d-"):
             continue
         path = folder / name
         try:
-            _, seconds, ticks, _ = name.split("-", 3)
-            frames.append((float(seconds), int(ticks), path))
+            _, before, after, _ = name.split("-", 3)
+            seconds, ticks = float(before), int(after)
+            if not math.isfinite(seconds) or ticks >= 1 << TICK_BITS:
+                raise ValueError
             size = path.stat().st_size
         except ValueError:
-            raise FormatError(f"{index}: {name!r} is not d-<seconds>-<ticks>-...pgm") from None
+            raise FormatError(
+                f"{where}: {name!a:.120} is not d-<seconds>-<ticks of {TICK_BITS} bits>-...pgm; "
+                "record again"
+            ) from None
         except OSError:
             raise FormatError(f"{path} is missing; record again") from None
         if size != len(_HEADER) + 2 * _SHAPE[0] * _SHAPE[1]:
             raise FormatError(f"{path} is torn ({size} bytes); record again")
+        # A calibration finds a frame's time and file by its ticks.
+        same, then = known.get(ticks, (0, -math.inf))
+        if abs(seconds - then) < _HALF_TURN_S:
+            raise FormatError(f"{where}: its ticks are those of line {same}; record again")
+        known[ticks] = number, seconds
+        frames.append((seconds, ticks, path))
     if not frames:
         raise FormatError(f"{index} lists no depth frame; record again")
+    # Ticks may start over, as those of a sensor that was plugged in again. Times may not: a replay
+    # takes the length of a pass from them.
+    if frames[-1][0] < frames[0][0]:
+        raise FormatError(f"{index}: its last frame is earlier than its first; record again")
     return frames
 
 

@@ -1,5 +1,7 @@
 """The virtual Kinect: what it shows, its noise, its clock, and its recordings."""
 
+import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +158,37 @@ def test_recordings_come_back_with_their_clock(tmp_path: Path) -> None:
         check_recording(tmp_path / "a")
     with pytest.raises(FormatError, match="station record-virtual"):
         check_recording(tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    ("index", "words"),
+    [
+        (b"d-0-7-0.pgm\nd-\xff", "INDEX.txt is not text"),
+        (b"c-0-7-0.ppm\nd-nan-7-0.pgm", "INDEX.txt, line 2: 'd-nan-7-0.pgm' is not d-<seconds>"),
+        (b"d-inf-7-0.pgm", "line 1: 'd-inf-7-0.pgm' is not d-<seconds>"),
+        (b"d-0-4294967296-0.pgm", "is not d-<seconds>-<ticks of 32 bits>"),
+        (b"d-0-" + 5000 * b"9" + b"-0.pgm", "is not d-<seconds>-<ticks of 32 bits>"),
+        (b"d-0-7-0.pgm\nd-1-8-1.pgm\nd-2-7-2.pgm", "line 3: its ticks are those of line 1"),
+        (b"d-9-7-0.pgm\nd-8-8-1.pgm", "its last frame is earlier than its first"),
+        (b"c-0-7-0.ppm", "lists no depth frame"),
+    ],
+)
+def test_a_line_that_no_recorder_writes_is_named(tmp_path: Path, index: bytes, words: str) -> None:
+    for name in index.split():
+        if len(name) < 100:
+            path = tmp_path / os.fsdecode(name)
+            path.write_bytes(b"P5 640 480 65535\n" + bytes(2 * 640 * 480))
+    (tmp_path / "INDEX.txt").write_bytes(index)
+    with pytest.raises(FormatError, match=re.escape(words)):
+        check_recording(tmp_path)
+
+
+def test_ticks_may_start_over_and_come_again_after_a_turn(tmp_path: Path) -> None:
+    names = ("d-0-9-0.pgm", "d-1-70-1.pgm", "d-2-8-2.pgm", "d-72-9-3.pgm")
+    for name in names:
+        (tmp_path / name).write_bytes(b"P5 640 480 65535\n" + bytes(2 * 640 * 480))
+    (tmp_path / "INDEX.txt").write_text("\n".join(names))
+    assert [ticks for _, ticks, _ in check_recording(tmp_path)] == [9, 70, 8, 9]
 
 
 @pytest.mark.parametrize("content", [b"", b"no mesh"])
