@@ -189,6 +189,18 @@ def test_list_and_find_on_the_command_line(spool: Spool) -> None:
     assert "no scan matches 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
 
 
+def test_a_list_since_what_is_no_day_is_refused(spool: Spool) -> None:
+    """It said that there were no scans."""
+    option = _booth(spool)
+
+    def listed(since: str) -> str:
+        return CliRunner().invoke(station, ["list", "--since", since, *option]).output
+
+    assert "gestern is no day or time: write 2026-11-21" in listed("gestern")
+    assert listed("2099-01-01") == "no scans since 2099-01-01T00:00:00\n"
+    assert listed("20261123").count("\n") == listed("2026-11-23T00:00+00:00").count("\n") > 0
+
+
 def test_purge_by_label(spool: Spool) -> None:
     option = _booth(spool)
     done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
