@@ -181,6 +181,17 @@ def test_a_height_that_is_decimetres_off_is_named() -> None:
     assert refusals.height_words(problem, _raised_to(0.75)) is None
 
 
+def test_a_height_that_may_be_wrong_is_mentioned() -> None:
+    """One that was measured 5 mm wrong passed without a word."""
+    problem, right = places("hanging-700", "hanging-1805"), Doubt(("hanging-1805",), 0.04, -0.003)
+    assert refusals.doubt_words(problem, replace(state(), doubts=[right])) == ""
+    doubtful = replace(state(), doubts=[replace(right, probability=0.14)])
+    said = refusals.doubt_words(problem, doubtful)
+    assert said.startswith(
+        "the ball at the height of 1.805 m seems 3 mm too low: measure the height"
+    )
+
+
 def test_nothing_is_advised_that_was_done() -> None:
     """A ball that had hung at two heights was to be hung at two heights."""
     assert refusals.slope_words(places("around-0", "hanging-400", "hanging-1700")) == ""

@@ -53,6 +53,12 @@ _SURELY_WRONG = 0.5
 _LARGEST_SLOPE_RAD = np.radians(0.15)
 """A body's head is 5 mm to one side at it; heights hardly change (0.01 mm)."""
 SIGMAS_95 = 1.96
+_MAYBE_WRONG = 0.08
+"""... and from which on it is mentioned; up to 0.04 where all is right."""
+_MEASURE_AGAIN = (
+    "measure the height of its underside above the floor again, and show the ball at its heights "
+    "anew (station calibrate stand)"
+)
 _START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = (
     "hang the ball above the mark, or put it on a stand, at measured heights (station calibrate "
@@ -278,10 +284,22 @@ def height_words(problem: Problem, start: State) -> str | None:
         if abs(off_m) > _HEIGHT_TOLERANCE_M:
             return (
                 f"the ball that was said to be {height_m:.2f} m above the floor was seen near "
-                f"{height_m + off_m:.2f} m: measure the height of its underside above the floor "
-                "again, and show the ball at its heights anew (station calibrate stand)"
+                f"{height_m + off_m:.2f} m: {_MEASURE_AGAIN}"
             )
     return None
+
+
+def doubt_words(problem: Problem, state: State) -> str:
+    """Advice against a height that may be wrong by some millimetres; "" where none is."""
+    for doubt in state.doubts:
+        place = doubt.places[0]
+        if place in problem.heights_m and doubt.probability > _MAYBE_WRONG:
+            return (
+                f"the ball at the height of {problem.heights_m[place]:.3f} m seems "
+                f"{1e3 * abs(doubt.off_m):.0f} mm too {'high' if doubt.off_m > 0.0 else 'low'}: "
+                f"{_MEASURE_AGAIN}"
+            )
+    return ""
 
 
 def check_doubts(problem: Problem, state: State) -> None:
@@ -296,9 +314,8 @@ def check_doubts(problem: Problem, state: State) -> None:
         heights = ", ".join(f"{problem.heights_m[place]:.3f}" for place in worst.places)
         raise CalibrationError(
             f"the ball at the height of {heights} m was seen {1e3 * abs(worst.off_m):.0f} mm too "
-            f"{'high' if worst.off_m > 0.0 else 'low'}: measure the height of its underside above "
-            "the floor again, and show the ball at its heights anew (station calibrate stand); if "
-            "it was right, let the sensors warm up and wave the ball again"
+            f"{'high' if worst.off_m > 0.0 else 'low'}: {_MEASURE_AGAIN}; if it was right, let the "
+            "sensors warm up and wave the ball again"
         )
     if worst.places == (PLUMB,):
         raise CalibrationError(

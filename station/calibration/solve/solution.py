@@ -186,7 +186,7 @@ def solve(
         stood, boarded = bool(problem.heights_m), _boarded(problem)
         refusals.check_predicted(predicted, limits, coverage, stood, boarded)
         rig = replace(rig, predicted=predicted)
-        weak = _advice(problem, predicted, world_poses, limits, coverage)
+        weak = _advice(problem, state, predicted, world_poses, limits, coverage)
         leveled_by = refusals.leveled_by(problem)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m, leveled_by)
 
@@ -247,11 +247,13 @@ def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem,
 
 
 def _advice(
-    problem: Problem, predicted: PredictedError, world_poses: WorldPoses, limits: Limits,
-    coverage: Coverage,
+    problem: Problem, state: State, predicted: PredictedError, world_poses: WorldPoses,
+    limits: Limits, coverage: Coverage,
 ) -> tuple[str, ...]:  # fmt: skip
     """Sentences on what could be better."""
     weak = [] if coverage.enough else [coverage.advice()]
+    if words := refusals.doubt_words(problem, state):
+        weak.append(words)
     stood = bool(problem.heights_m)
     if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
         weak.append(f"for heights, {refusals.remedy(stood, refusals.STAND_WORDS)}")
