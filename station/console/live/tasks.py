@@ -157,7 +157,8 @@ class Tasks:
             state = self._state
             match said.get("kind"):
                 case "step":
-                    state |= {"title": said["title"], "instruction": text, "progress": ""}
+                    state |= {"title": said["title"], "instruction": text}
+                    state |= {"progress": "", "question": ""}
                     state["waits_for"] = "go" if said.get("waits") else ""
                 case "countdown":
                     state["countdown_s"] = said["left_s"] or None

@@ -4,12 +4,21 @@ import { freshKey, get, post, remove } from './api.js';
 import { Cameras } from './cameras.js';
 import { ask, h, notice } from './dom.js';
 import { listen } from './events.js';
-import { said, t, time } from './i18n.js';
+import { said as sentence, t, time } from './i18n.js';
 import { settings } from './settings.js';
 
 const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
 const LOWEST_M = 0.3;
 const HIGHEST_M = 2.2;
+const COMMAND = /station calibrate(?: (--new|[a-z]+))?(?: --[a-z]+)*/g;
+
+// What the station says; the commands that it names are buttons here.
+function said(text) {
+  return sentence(text).replace(COMMAND, (_, word) => {
+    const key = word === '--new' ? 'new' : STEPS.includes(word) ? word : 'continue';
+    return t('cal.button', { name: t(`cal.${key}`) });
+  });
+}
 
 export async function calibration(main, session) {
   const booth = await get('/booth');
@@ -58,7 +67,7 @@ export async function calibration(main, session) {
     const bar = h('progress', { max: 1, 'aria-label': said(task.progress) || t('loading') });
     if (share !== null) bar.value = share;
     now.className = 'card now';
-    now.replaceChildren(h('h2', {}, task.title ? said(task.title) : t('loading')), h('p', { className: 'instruction' }, said(asks(task) ? task.question : task.instruction)),
+    now.replaceChildren(h('h2', {}, task.title ? said(task.title) : t('loading')), h('p', { className: 'instruction' }, said(asks(task) ? task.question : task.instruction || task.question)),
       task.countdown_s ? h('div', { className: 'count' }, String(task.countdown_s)) : '',
       task.waits_for === 'height' ? height() : '',
       h('div', { className: 'actions left' },
