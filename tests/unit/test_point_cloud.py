@@ -10,6 +10,8 @@ from station.core.errors import InputError
 from workers.cloud import cloud_file
 from workers.cloud.cloud_file import read_cloud
 
+BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
+
 
 def _written(path: Path, points: np.ndarray) -> Path:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -134,3 +136,19 @@ def test_the_floor_and_what_stands_on_it_are_taken_away(tmp_path: Path) -> None:
 def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:
     points = _person(np.random.default_rng(4))
     assert len(read_cloud(_written(tmp_path / "a.ply", points), "z")) == len(points)
+
+
+def test_normals_between_limbs_point_outwards(tmp_path: Path) -> None:
+    """Skin between limbs, where another limb lies behind it and before it, is oriented too."""
+    body = np.load(BODIES / "ann.npz")
+    surface = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(body["vertices"]), o3d.utility.Vector3iVector(body["faces"])
+    )
+    surface.compute_triangle_normals()
+    o3d.utility.random.seed(5)
+    sampled = surface.sample_points_uniformly(20_000, use_triangle_normal=True)
+    bare = o3d.geometry.PointCloud(sampled.points)
+    o3d.io.write_point_cloud(tmp_path / "bare.ply", bare)
+    normals = read_cloud(tmp_path / "bare.ply", "z").normals
+    outwards = np.einsum("ni,ni->n", normals, np.asarray(sampled.normals)) > 0.0
+    assert outwards.mean() > 0.96

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
@@ -24,15 +25,17 @@ _NORMAL_NEIGHBOURS = 24
 """Neighbours that a normal is estimated from."""
 _UNIT = 0.01
 """Deviation from 1 of a normal's length in a file: formats round to a few digits."""
-_ORIENTED, _OPPOSITE = 25_000, 12_000
-"""Points whose normals are oriented, and points among which the body's other side is searched."""
-_DEPTHS_M = (0.06, 0.09, 0.13, 0.18, 0.24, 0.30)
-"""Thicknesses of a body, from forearms to trunks."""
-_WIDENING, _SPACING_M = 0.25, 0.01
-"""Tolerance across the normal, as a share of the depth and absolute: the other side is slanted and
-sampled."""
-_NEARNESS_M = 0.15
-"""Decay of a point's weight with its depth: farther away there may be another limb."""
+_ORIENTED = 25_000
+"""Points whose normals are oriented; the others follow the nearest of them."""
+_DIRECTIONS = 40
+"""Directions, evenly around, from which a cloud is looked at."""
+_PIXEL_M = 0.015
+"""Pixels of these pictures: points are 5 to 8 mm apart."""
+_HIDDEN_M = 0.02
+"""Depth behind the nearest of the pixels around it from which a point is hidden: that of slanted
+skin, and less than a hand is thick."""
+_FLAT_M = 0.005
+"""Least standard deviation of a body's points across its thinnest direction."""
 _FOOT_M = 0.12
 """Height of a foot."""
 _LINKS, _SPREAD_ROUNDS = 8, 150
@@ -155,31 +158,17 @@ def _has_unit_normals(cloud: o3d.geometry.PointCloud) -> bool:
 
 
 def _estimate_normals(cloud: o3d.geometry.PointCloud, path: Path) -> None:
-    """Give a cloud normals that point out of the body or into it.
-
-    Orientation along a spanning tree takes minutes on large clouds: it is done on some points, and
-    the others follow the nearest of them.
-    """
+    """Give a cloud normals that point out of the body or into it."""
+    points = np.asarray(cloud.points)
+    if np.linalg.matrix_rank(points - points.mean(axis=0), _FLAT_M * np.sqrt(len(points))) < 3:
+        raise InputError(f"{path} is flat; a body has a front and a back")
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
-    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    every = max(1, len(points) // _ORIENTED)
-    some = cloud.select_by_index(np.arange(0, len(points), every))
-    try:
-        some.orient_normals_consistent_tangent_plane(_NORMAL_NEIGHBOURS)
-    except RuntimeError as error:
-        raise InputError(f"{path} is flat; a body has a front and a back") from error
-    nearest = cKDTree(np.asarray(some.points)).query(points, workers=-1)[1]
-    agrees = np.einsum("ni,ni->n", np.asarray(some.normals)[nearest], normals) >= 0.0
-    oriented = np.where(agrees[:, None], normals, -normals)
-    cloud.normals = o3d.utility.Vector3dVector(_outwards(points, oriented))
+    cloud.normals = o3d.utility.Vector3dVector(_outwards(points, np.asarray(cloud.normals)))
 
 
 def _outwards(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) of a body's points (n, 3), each oriented outwards by what lies behind the skin
-    around it.
-
-    Neighbours agree in sign mostly; across the gaps between two scanners' views and at the rims of
-    feet that agreement is lost, and a piece of the skin may point inwards.
+    """Normals (n, 3) of a body's points (n, 3), each oriented to where the skin around it is seen
+    from.
     """
     chosen = slice(None, None, max(1, len(points) // _ORIENTED))
     places, directions = points[chosen], normals[chosen]
@@ -214,21 +203,32 @@ def _evidence(points: Array, places: Array, directions: Array) -> Array:
     """Evidence (n,) that directions (n, 3) at places (n, 3) of a cloud point out of the body;
     negative where they point into it.
 
-    The body's other side lies behind the skin, and below a foot the floor; in front of it there is
-    nothing, or another limb farther away. This fails between limbs and on hands.
+    Whoever sees a place looks at the skin's outside. A foot stands on a floor, which hides its
+    inside from below.
     """
     low_m = float(points[:, 2].min())
-    standing = points[points[:, 2] < low_m + _FOOT_M] * (1.0, 1.0, 0.0) + (0.0, 0.0, low_m)
-    every = max(1, len(points) // _OPPOSITE)
-    others = cKDTree(np.concatenate([points[::every], standing[::every]]))
+    floor = points[points[:, 2] < low_m + _FOOT_M] * (1.0, 1.0, 0.0) + (0.0, 0.0, low_m)
+    seen = np.concatenate([points, floor])
     found = np.zeros(len(places))
-    for depth_m in _DEPTHS_M:
-        gap_m = _WIDENING * depth_m + _SPACING_M
-        for side in (1.0, -1.0):
-            there = places + side * depth_m * directions
-            away = others.query(there, distance_upper_bound=gap_m, workers=-1)[0]
-            found -= side * (away < gap_m) * np.exp(-depth_m / _NEARNESS_M)
+    for towards in _evenly_around(_DIRECTIONS):
+        across = np.linalg.svd(towards[None])[2][1:].T
+        corner = (seen @ across).min(axis=0) - _PIXEL_M
+        pixel = ((seen @ across - corner) / _PIXEL_M).astype(np.int64)
+        nearest = np.full(pixel.max(axis=0) + 2, -np.inf)
+        np.maximum.at(nearest, tuple(pixel.T), seen @ towards)
+        nearest = ndimage.maximum_filter(nearest, 3)
+        mine = ((places @ across - corner) / _PIXEL_M).astype(np.int64)
+        visible = places @ towards > nearest[tuple(mine.T)] - _HIDDEN_M
+        found += visible * (directions @ towards)
     return found
+
+
+def _evenly_around(count: int) -> Array:
+    """Unit vectors (count, 3) on a spiral of equal steps in height (Fibonacci's lattice)."""
+    step = np.arange(count) + 0.5
+    turn, height = np.pi * (3.0 - np.sqrt(5.0)) * step, 1.0 - 2.0 * step / count
+    level = np.sqrt(1.0 - height**2)
+    return np.column_stack([level * np.cos(turn), level * np.sin(turn), height])
 
 
 def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
