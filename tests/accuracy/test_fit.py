@@ -211,6 +211,25 @@ def test_half_a_body_is_no_confident_one(model: BodyModel) -> None:
     assert any("% of the person's back" in reason for reason in verdict.reasons)
 
 
+@pytest.mark.parametrize("cut_m", [0.04, 0.08, 0.2])
+def test_legs_without_feet_do_not_end_on_the_floor(model: BodyModel, cut_m: float) -> None:
+    """The fit pressed them onto it: heights were too small by all that was missing, with "ok"."""
+    normals = vertex_normals(model.mean, model.faces)
+    kept = model.mean[:, 2] > cut_m
+    points, count = model.mean[kept] - (0.0, 0.0, cut_m), int(kept.sum())
+    cloud = PointCloud(
+        points, normals[kept], np.full(count, 1e-3), np.zeros(count, np.int16), ("cloud",)
+    )
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    assert fit.verdict.status == "rescan"
+    assert any("toes of the" in reason for reason in fit.verdict.reasons)
+    measured = measure_body(model, fit.overlapping, fit.vertex_sigma_m, fit.vertex_seen)
+    blank = {row.name for row in measured.rows if row.parts & fit.verdict.missing_parts}
+    ends_below = {"height", "crotch_height", "outside_leg_length_left", "calf_girth_right"}
+    assert ends_below <= blank
+    assert blank.isdisjoint({"waist_girth", "chest_girth", "head_girth", "upper_arm_girth_left"})
+
+
 @pytest.mark.parametrize("name", ["ann", "ben", "cleo"])
 def test_dark_hair_leaves_the_face_in_its_place(
     model: BodyModel, tmp_path: Path, name: str

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import PointCloud
 from workers.scape.evidence.inside import shares_inside
-from workers.scape.fit.posture import arms_inside, head_turned, leaning
+from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
 from workers.scape.fit.verdict import PartReport, judge, lost_parts
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import FLOOR, BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 
 Array = NDArray[np.float64]
@@ -35,6 +35,20 @@ def _scan_of(model: BodyModel, vertices: Array) -> PointCloud:
     return PointCloud(
         points, directions, np.full(count, 1e-3), np.zeros(count, np.int16), ("cloud",)
     )
+
+
+def test_a_bare_cloud_shows_where_its_feet_are(model: BodyModel) -> None:
+    assert feet_cut_off(model, model.mean, model.mean[::4]) == {}
+    left = model.mean[:, 0] > 0.0
+    for cut, feet in ((left, ["foot_left"]), (~left, ["foot_right"]), (left | ~left, None)):
+        kept = model.mean[~cut | (model.mean[:, 2] > 0.05)]
+        found = feet_cut_off(model, model.mean, kept)
+        assert list(found) == (feet or ["foot_left", "foot_right"])
+        bare, booth = _verdict(model, {}, {}, found), _verdict(model, {}, {"a": 0.0}, found)
+        assert bare.status == "rescan"
+        assert FLOOR in bare.missing
+        # A booth knows its floor.
+        assert FLOOR not in booth.missing
 
 
 def _elbow_bent(model: BodyModel, degrees: float) -> Array:
@@ -140,7 +154,7 @@ def test_readings_that_scatter_are_the_reason_where_there_is_no_other(model: Bod
 def test_what_hangs_on_a_missing_part_is_missing(model: BodyModel) -> None:
     sides = {"front": 0.9, "back": 0.9}
     parts = [PartReport("thigh_right", 0.1, 1e-3), PartReport("shin_right", 0.4, 1e-3)]
-    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
+    verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {"a": 0.0}, 1e-3)
     assert set(verdict.missing) == {"thigh_right", "shin_right", "foot_right"}
 
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from workers.measure.coverage import Basis, SeenSkin
 from workers.measure.intervals import Pose, ScanErrors, content_interval, intervals, row_values
-from workers.measure.kinds import Top
+from workers.measure.kinds import Route, Top
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
-from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.body_model import FLOOR, BodyModel, BodyState
 from workers.scape.model.deformation import signed_volume, triangle_areas
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class Measurement:
     basis: Basis
     """Whether cameras saw the line."""
     parts: frozenset[str]
-    """Parts of the body that the line or its landmarks lie on."""
+    """Parts of the body that the line or its landmarks lie on, and `FLOOR` where it ends there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,4 +167,8 @@ def _is_top(trace: Trace) -> bool:
 def _parts_of(model: BodyModel, trace: Trace) -> frozenset[str]:
     landmarks = [model.landmarks[name] for name in trace.definition.landmarks]
     vertices = np.concatenate([trace.points.tail, np.array(landmarks, np.intp)])
-    return frozenset(model.part_names[part] for part in np.unique(model.part_of_vertex[vertices]))
+    parts = {model.part_names[part] for part in np.unique(model.part_of_vertex[vertices])}
+    kind = trace.definition.kind
+    if isinstance(kind, Top) or (isinstance(kind, Route) and "floor" in kind.legs):
+        parts.add(FLOOR)
+    return frozenset(parts)

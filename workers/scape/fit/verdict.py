@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from workers.cloud.observed import Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
-from workers.scape.model.body_model import HAND, BodyModel
+from workers.scape.model.body_model import FLOOR, HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
 
 Array = NDArray[np.float64]
@@ -62,6 +62,7 @@ half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
 _EXTREMITIES = ("hand", "foot", "shoulder", "neck", "head")
 _CHAINS = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
 """Parts of a limb, outwards."""
+_FEET = frozenset({"foot_left", "foot_right"})
 _UPRIGHT = ("head", "neck", "thigh", "shin", "foot")
 """Parts without which a body seems shorter."""
 _SCATTER_M = 0.006
@@ -92,7 +93,7 @@ class Verdict:
     """Remarks on the booth that do not touch this scan."""
     missing: tuple[str, ...] = ()
     """Parts that were not seen or that do not match the scan: nothing can be measured there. A hand
-    stands for its thumb and fingers."""
+    stands for its thumb and fingers; `FLOOR` is one of them."""
 
     @property
     def missing_parts(self) -> frozenset[str]:
@@ -194,7 +195,7 @@ def judge(
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
         rms_m: distance of the points from the surface.
-        misplaced: what `head_turned` and `arms_inside` give.
+        misplaced: what `head_turned`, `arms_inside` and `feet_cut_off` give.
     """
     unseen = _unseen_parts(parts)
     moved, notes = _moved_cameras(camera_shifts_m)
@@ -224,6 +225,9 @@ def judge(
     if reasons:
         missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
     missing = _with_rest_of_limbs(missing, lost, parts)
+    if not camera_shifts_m and not _FEET.isdisjoint(missing):
+        # Only feet show where the floor of a bare cloud is; legs without them were pressed to it.
+        missing += [FLOOR, *(part for limb in _limbs() if limb[-1] in _FEET for part in limb[1:])]
     if everywhere:
         missing += [part.name for part in parts]
     elif halves or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):

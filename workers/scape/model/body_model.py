@@ -44,6 +44,8 @@ SHIPPED = "data/body.npz"
 
 HAND = ("hand", "thumb", "fingers")
 """Parts of a hand, each after its parent."""
+FLOOR = "floor"
+"""Stands beside the parts for where a body stands: heights end there."""
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
