@@ -61,7 +61,7 @@ _MIN_READINGS = 5
 """Fewer of them may be stray."""
 _UNKNOWN_HEAD_M = 0.03
 """Standard deviation where there is no reading of the head: the length of a head varies by it."""
-_FACE_ALONE_M = 0.011
+FACE_ALONE_M = 0.011
 """Standard deviation where dark hair hides all but the face: 9 mm rms on sculpted bodies, 4
 on those of the model's own family."""
 _FACE = 0.08
@@ -134,7 +134,7 @@ def crown_sigma_m(
     heights = np.sort(points[over_head, 2])
     gap = float(top[2] - heights[-_MIN_READINGS]) if len(heights) >= _MIN_READINGS else np.inf
     if gap > _CAP_M:
-        return _FACE_ALONE_M if seen[_head(model)[0]].mean() > _FACE else _UNKNOWN_HEAD_M
+        return FACE_ALONE_M if seen[_head(model)[0]].mean() > _FACE else _UNKNOWN_HEAD_M
     if gap < _REACHED_M:
         return 0.0
     return min(max(abs(gap - _BEYOND_M), _BEYOND_SIGMA_M), _MODEL_SIGMA_M)

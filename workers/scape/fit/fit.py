@@ -32,7 +32,7 @@ from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
-from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
+from workers.scape.fit.posture import arms_inside, feet_cut_off, head_cut_off, head_turned, leaning
 from workers.scape.fit.sampling import Sampling
 from workers.scape.fit.unmatched import Patch, unmatched_patches
 from workers.scape.fit.verdict import (
@@ -237,6 +237,7 @@ def separate_limbs(
     misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
     if not fit.camera_shifts_m:
         misplaced |= feet_cut_off(model, vertices, fit.cloud.points)
+        misplaced |= head_cut_off(model, surface.seen, fit.crown_sigma_m)
     lost = lost_parts(model, fit.patches.result())
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)

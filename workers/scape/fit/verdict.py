@@ -195,7 +195,7 @@ def judge(
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
         rms_m: distance of the points from the surface.
-        misplaced: what `head_turned`, `arms_inside` and `feet_cut_off` give.
+        misplaced: what `head_turned`, `arms_inside`, `feet_cut_off` and `head_cut_off` give.
     """
     unseen = _unseen_parts(parts)
     moved, notes = _moved_cameras(camera_shifts_m)
@@ -216,7 +216,7 @@ def judge(
     if len(unseen) > _PARTS_NAMED:
         reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
     else:
-        reasons += unseen.values()
+        reasons += [reason for part, reason in unseen.items() if part not in misplaced]
     reasons += stature if cut else []
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
