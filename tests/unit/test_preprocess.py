@@ -19,6 +19,7 @@ from station.core.rig import CameraCalibration, PredictedError
 from station.simulation.scene import Mesh, box, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
+from workers.cloud.observed import RAISED_FLOOR
 from workers.cloud.one_person import cells_of
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
@@ -195,6 +196,19 @@ def test_what_a_calibration_says_of_its_errors_goes_with_the_scan(bundle: Path) 
     told = replace(read, rig=replace(read.rig, predicted=said))
     assert preprocess(told).predicted == said
     assert preprocess(read).predicted is None
+
+
+def test_a_mat_that_was_not_there_at_the_calibration_is_named(tmp_path: Path) -> None:
+    """Noise lifts some of it above the floor's clearance, and nothing matched a body any more."""
+    body = load_mesh(BODIES / "ann.npz")
+    standing = Mesh(body.vertices + np.array([0.0, 0.0, 0.008]), body.faces)
+    booth = SimulatedBooth(seed=3, clutter=[box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.008))])
+    scan = preprocess(read_bundle(render_bundle(standing, tmp_path / "mat", booth)))
+    (finding,) = scan.findings
+    assert finding.code == RAISED_FLOOR
+    assert "take mats away" in finding.message
+    level = (scan.cloud.points[:, 2] < 0.015) & (scan.cloud.normals[:, 2] > 0.9)
+    assert level.sum() < 30
 
 
 def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workers.cloud.observed import PointCloud
+from workers.cloud.observed import RAISED_FLOOR, Finding, PointCloud
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
@@ -49,6 +49,13 @@ def test_a_bare_cloud_shows_where_its_feet_are(model: BodyModel) -> None:
         assert FLOOR in bare.missing
         # A booth knows its floor.
         assert FLOOR not in booth.missing
+
+
+def test_heights_above_a_mat_are_blank(model: BodyModel) -> None:
+    sides, beta = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count)
+    mat = Finding(RAISED_FLOOR, None, 0.012, "there is a mat")
+    verdict = judge((), sides, [mat], {}, 1.75, beta, {"a": 0.0}, 1e-3)
+    assert (verdict.reasons, verdict.missing) == (("there is a mat",), (FLOOR,))
 
 
 def _elbow_bent(model: BodyModel, degrees: float) -> Array:

@@ -18,13 +18,16 @@ MIN_POINTS = 1500
 POSSIBLE_HEIGHTS_M = (1.0, 2.6)
 """A cloud that is lower or higher than this is not a standing person in metres."""
 
+RAISED_FLOOR = "floor-raised"
+"""Code of the finding that a person stands on something: heights are not those above z = 0."""
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind", "frames-missing" or "leaning"."""
+    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or `RAISED_FLOOR`."""
     camera: str | None
     value: float | None
     message: str

@@ -33,7 +33,7 @@ of: 0.90 and more on 14 booth clouds and on sampled bodies of 3000 points or mor
 least it is at most 0.24 where 4 cm are cut off, 0.06 where 6 are: the fit presses what is left of
 the legs onto the floor."""
 _BROW_SEEN, _NAPE_SEEN = 0.6, 0.4
-"""Share of the brow that was seen at least, and of the back of the head below it at most, where dark
+"""Share of the brow that was seen at least, and of the back of the head below it at most, if dark
 hair hides the top: 0.75 and 0.13 on three bodies. Where 14 cm or more of a head are cut off,
 heights are up to 44 mm off, and the brow has at most 0.47 or the back at least 0.5."""
 _BROW_LEVELS, _NAPE_LEVELS, _SIDEWAYS = (0.58, 0.70), (0.25, 0.6), 0.5
