@@ -7,6 +7,7 @@ import open3d as o3d
 import pytest
 
 from station.core.errors import InputError
+from station.core.geometry import so3_exp
 from workers.cloud import cloud_file
 from workers.cloud.cloud_file import read_cloud
 
@@ -131,6 +132,17 @@ def test_the_floor_and_what_stands_on_it_are_taken_away(tmp_path: Path) -> None:
     assert np.abs(cloud.points[:, :2]).max() < 0.2
     assert cloud.points[:, 2].max() == pytest.approx(1.75, abs=0.01)
     assert cloud.origin_m[2] == pytest.approx(-0.4, abs=0.005)
+
+
+@pytest.mark.parametrize("tilt_deg", [2.0, 4.0, 10.0])
+def test_a_tilted_floor_is_named(tmp_path: Path, tilt_deg: float) -> None:
+    """It was left in the cloud, and the verdict spoke of the person's front."""
+    rng = np.random.default_rng(3)
+    floor = np.column_stack([rng.uniform(-1.0, 1.0, (20_000, 2)), np.zeros(20_000)])
+    turn = so3_exp([np.radians(tilt_deg), 0.0, 0.0])
+    points = np.concatenate([_person(rng), floor]) @ turn.T
+    with pytest.raises(InputError, match=f"its floor is tilted by {tilt_deg:.0f} degrees"):
+        read_cloud(_written(tmp_path / "a.ply", points), "z")
 
 
 def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:

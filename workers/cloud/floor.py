@@ -37,6 +37,13 @@ _CLEARANCE_M = 0.015
 """Points so near to the floor are taken away with it: noise of the floor, and soles."""
 _VOXEL_M = 0.04
 _PLANE_ROUNDS = 4
+_LEVEL = np.tan(np.radians(1.5))
+"""Slope of a floor from which the cloud is not level: the body would lean by it, and stand on one
+foot's edge."""
+_STEEPEST = np.cos(np.radians(20.0))
+"""Least z component of the normal of a plane that may be a floor in a frame that is not level."""
+_PLANES, _PLANE_POINTS = 400, 2000
+"""Planes through three points that are tried, and points that vote for them."""
 
 
 def check_units(points: Array, unit: str, up: str) -> None:
@@ -79,9 +86,13 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
 
     Args:
         points: (n, 3), metres, z up.
+
+    Raises:
+        InputError: the floor is tilted.
     """
     start_m = _floor_band(points)
     if start_m is None:
+        _check_tilted_floor(points)
         return None
     plane = np.array([0.0, 0.0, start_m + 0.5 * _BAND_M])
     near = np.abs(points[:, 2] - plane[2]) < 2.0 * _BAND_M
@@ -89,6 +100,8 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
         basis = np.column_stack([points[near, :2], np.ones(int(near.sum()))])
         plane = np.linalg.lstsq(basis, points[near, 2], rcond=None)[0]
         near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _CLEARANCE_M
+    if np.linalg.norm(plane[:2]) > _LEVEL:
+        raise _not_level(float(np.arctan(np.linalg.norm(plane[:2]))))
     over = points[:, 2] - points[:, :2] @ plane[:2] - plane[2] > _CLEARANCE_M
     person = np.flatnonzero(over)[_largest_piece(points[over])]
     kept = np.zeros(len(points), bool)
@@ -109,10 +122,50 @@ def _floor_band(points: Array) -> float | None:
     return float(bands[best])
 
 
+def _check_tilted_floor(points: Array) -> None:
+    """Refuse a cloud with a floor that no horizontal band holds: lowest points are no soles there.
+
+    Raises:
+        InputError: a slanted plane through some of the lowest points is as large as a floor.
+    """
+    low, high = np.quantile(points[:, 2], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
+    lowest = points[points[:, 2] < low + _LOWEST_SHARE * (high - low)]
+    draw = np.random.default_rng(len(points)).integers(len(lowest), size=(3, _PLANES))
+    first, second, third = lowest[draw]
+    normals = np.cross(second - first, third - first)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals *= np.sign(normals[:, 2:])
+    slanted = normals[:, 2] > _STEEPEST
+    if not slanted.any():
+        return
+    normals, first = normals[slanted], first[slanted]
+    voters = lowest[:: max(1, len(lowest) // _PLANE_POINTS)]
+    away = np.abs(voters @ normals.T - np.einsum("pi,pi->p", first, normals))
+    best = int(np.argmax((away < _BAND_M).sum(axis=0)))
+    over_m = (points - first[best]) @ normals[best]
+    area, above = (
+        _covered_m2(points[np.abs(over_m - level_m) < _BAND_M]) for level_m in (0.0, _LEGS_M)
+    )
+    if area > max(_FLOOR_M2, _FLOOR_OVER_LEGS * above):
+        raise _not_level(float(np.arccos(normals[best, 2])))
+
+
+def _not_level(tilt_rad: float) -> InputError:
+    return InputError(
+        f"the cloud is not level: its floor is tilted by {np.degrees(tilt_rad):.0f} degrees; "
+        "turn the cloud until the floor is horizontal, and try again"
+    )
+
+
 def _area_m2(points: Array, start_m: float) -> float:
     """Area that a horizontal band's points cover."""
     inside = (points[:, 2] >= start_m) & (points[:, 2] < start_m + _BAND_M)
-    cells = np.unique(np.floor(points[inside, :2] / _CELL_M).astype(np.int64), axis=0)
+    return _covered_m2(points[inside])
+
+
+def _covered_m2(points: Array) -> float:
+    """Area that points cover, seen from above."""
+    cells = np.unique(np.floor(points[:, :2] / _CELL_M).astype(np.int64), axis=0)
     return len(cells) * _CELL_M**2
 
 
