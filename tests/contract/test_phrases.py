@@ -29,6 +29,7 @@ SPEAKERS = (
     "station/calibration/guide/steps.py",
     "station/calibration/guide/feed.py", "station/calibration/guide/session.py",
     "station/calibration/guide/store.py", "station/calibration/solve/refusals.py",
+    "station/calibration/solve/resting_ball.py",
     "station/calibration/solve/solution.py", "station/calibration/solve/acceptance.py",
     "station/calibration/solve/world.py",
     "station/calibration/solve/predicted.py", "station/calibration/detect/coverage.py",

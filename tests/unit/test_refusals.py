@@ -18,7 +18,7 @@ from station.calibration.detect.detections import (
     Observations,
     raised_height_m,
 )
-from station.calibration.solve import jumps, refusals
+from station.calibration.solve import jumps, refusals, resting_ball
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections, sorted_detections, without_gaps
 from station.calibration.solve.pairwise import Pair, Track
@@ -148,45 +148,47 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_predicted, predicted(1e-3, 5e-3), LIMITS, coverage(0), False, False
     ),
     "the floor's slope is only known to within 0.29 degrees: lay the ball to the left": partial(
-        refusals.check_slope, places(), world(slope_sigma_rad=5e-3)
+        resting_ball.check_slope, places(), world(slope_sigma_rad=5e-3)
     ),
     "0.29 degrees: hang the ball from one and the same hook at two heights": partial(
-        refusals.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
+        resting_ball.check_slope, places("around-0", "hanging-1700"), world(slope_sigma_rad=5e-3)
     ),
     "what is vertical is only known to within 0.29 degrees: .*; if it did hang": partial(
-        refusals.check_slope,
+        resting_ball.check_slope,
         places("around-0", "hanging-400", "hanging-1700"),
         world(slope_sigma_rad=5e-3),
     ),
     "the hanging ball's places are 12 mm from above one another: hang the ball from": partial(
-        refusals.check_doubts, places(), replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)])
+        resting_ball.check_doubts,
+        places(),
+        replace(state(), doubts=[Doubt(("plumb",), 0.9, 0.012)]),
     ),
     f"camera {NAMES[0]} would be 0.50 m below the floor": partial(
         refusals.check_upright, world(height_m=-0.5)
     ),
     "the ball in front of the mark lay where it lay on the mark": partial(
-        refusals.check_front, {"mark": np.zeros(3), "front": np.array([0.05, 0.0, 0.0])}
+        resting_ball.check_front, {"mark": np.zeros(3), "front": np.array([0.05, 0.0, 0.0])}
     ),
     "the ball on the mark is 20 mm too high": partial(
-        refusals.check_mark, world(mark_height_m=0.12), RADIUS_M
+        resting_ball.check_mark, world(mark_height_m=0.12), RADIUS_M
     ),
 }
 
 
 def test_a_height_that_is_decimetres_off_is_named() -> None:
     problem = places("hanging-700")
-    words = refusals.height_words(problem, _raised_to(1.7))
+    words = resting_ball.height_words(problem, _raised_to(1.7))
     assert words is not None
     assert "said to be 0.70 m above the floor was seen near 1.70 m: measure the height" in words
-    assert refusals.height_words(problem, _raised_to(0.75)) is None
+    assert resting_ball.height_words(problem, _raised_to(0.75)) is None
 
 
 def test_a_height_that_may_be_wrong_is_mentioned() -> None:
     """One that was measured 5 mm wrong passed without a word."""
     problem, right = places("hanging-700", "hanging-1805"), Doubt(("hanging-1805",), 0.04, -0.003)
-    assert refusals.doubt_words(problem, replace(state(), doubts=[right])) == ""
+    assert resting_ball.doubt_words(problem, replace(state(), doubts=[right])) == ""
     doubtful = replace(state(), doubts=[replace(right, probability=0.14)])
-    said = refusals.doubt_words(problem, doubtful)
+    said = resting_ball.doubt_words(problem, doubtful)
     assert said.startswith(
         "the ball at the height of 1.805 m seems 3 mm too low: measure the height"
     )
@@ -194,8 +196,8 @@ def test_a_height_that_may_be_wrong_is_mentioned() -> None:
 
 def test_nothing_is_advised_that_was_done() -> None:
     """A ball that had hung at two heights was to be hung at two heights."""
-    assert refusals.slope_words(places("around-0", "hanging-400", "hanging-1700")) == ""
-    assert refusals.slope_words(places("around-0", "stand-400", "stand-1700"))
+    assert resting_ball.slope_words(places("around-0", "hanging-400", "hanging-1700")) == ""
+    assert resting_ball.slope_words(places("around-0", "stand-400", "stand-1700"))
 
 
 @pytest.mark.parametrize("words", REFUSED)
@@ -219,7 +221,7 @@ def test_long_gaps_between_detections_take_no_memory() -> None:
 
 
 def test_what_is_sound_passes() -> None:
-    refusals.check_front({"mark": np.zeros(3), "front": np.array([0.5, 0.0, 0.0])})
+    resting_ball.check_front({"mark": np.zeros(3), "front": np.array([0.5, 0.0, 0.0])})
     refusals.check_rest(replace(seen(mark=True), front=[ball()]), ())
     refusals.check_pairs(tracks(), pairs(1.0))
     refusals.check_connected(NAMES, {name: np.eye(4) for name in NAMES})
@@ -227,9 +229,9 @@ def test_what_is_sound_passes() -> None:
     refusals.check_converged(state())
     refusals.check_held_out({NAMES[0]: HeldOut(100, 2e-3, np.zeros(3))})
     refusals.check_predicted(predicted(1e-3, 1e-3), LIMITS, coverage(0), False, False)
-    refusals.check_slope(places(), world())
+    resting_ball.check_slope(places(), world())
     refusals.check_upright(world())
-    refusals.check_mark(world(), RADIUS_M)
+    resting_ball.check_mark(world(), RADIUS_M)
     assert refusals.check_radius([ball()] * 3, RADIUS_M) == RADIUS_M
 
 

@@ -31,7 +31,7 @@ from station.calibration.detect.detections import (
     Observations,
     raised_height_m,
 )
-from station.calibration.solve import acceptance, refusals, world
+from station.calibration.solve import acceptance, refusals, resting_ball, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (
     Detections,
@@ -166,7 +166,7 @@ def solve(
         refusals.check_rest(observations, front_cameras)
         progress("finding the relative positions of the cameras")
         problem, poses = _first_problem(observations, cameras, radius_m, reference)
-        if words := refusals.height_words(problem, first_state(problem, poses)):
+        if words := resting_ball.height_words(problem, first_state(problem, poses)):
             raise CalibrationError(words)
         progress("solving, with a fifth of the seconds kept for the test")
         training, tested, found = _tested(problem, poses)
@@ -177,9 +177,9 @@ def solve(
         refusals.check_upright(world_poses)
         refusals.check_solved_radius(problem, state)
         refusals.check_unmoved(problem, state)
-        refusals.check_doubts(problem, state)
-        refusals.check_slope(problem, world_poses)
-        refusals.check_mark(world_poses, radius_m)
+        resting_ball.check_doubts(problem, state)
+        resting_ball.check_slope(problem, world_poses)
+        resting_ball.check_mark(world_poses, radius_m)
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
@@ -187,7 +187,7 @@ def solve(
         refusals.check_predicted(predicted, limits, coverage, stood, boarded)
         rig = replace(rig, predicted=predicted)
         weak = _advice(problem, state, predicted, world_poses, limits, coverage)
-        leveled_by = refusals.leveled_by(problem)
+        leveled_by = resting_ball.leveled_by(problem)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m, leveled_by)
 
 
@@ -206,7 +206,7 @@ def height_words(
             problem, poses = _first_problem(observations, cameras, radius_m, reference)
         except CalibrationError:
             return None
-        return refusals.height_words(problem, first_state(problem, poses))
+        return resting_ball.height_words(problem, first_state(problem, poses))
 
 
 def _first_problem(
@@ -237,7 +237,7 @@ def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem,
         averaged = averaged_state(problem, state)
         if not refusals.converged(state):
             # A wrong height may be what does not let it settle.
-            refusals.check_doubts(problem, averaged)
+            resting_ball.check_doubts(problem, averaged)
         refusals.check_converged(state)
         return problem, averaged
     except np.linalg.LinAlgError:
@@ -252,7 +252,7 @@ def _advice(
 ) -> tuple[str, ...]:  # fmt: skip
     """Sentences on what could be better."""
     weak = [] if coverage.enough else [coverage.advice()]
-    if words := refusals.doubt_words(problem, state):
+    if words := resting_ball.doubt_words(problem, state):
         weak.append(words)
     stood = bool(problem.heights_m)
     if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
@@ -262,8 +262,10 @@ def _advice(
     if not _boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")
     if any(at.startswith(HANGING) for at in problem.heights_m) and plumb_ends(problem) is None:
-        weak.append(f"to know what is vertical, {refusals.HANGING_WORDS}")
-    elif world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD and (words := refusals.slope_words(problem)):
+        weak.append(f"to know what is vertical, {resting_ball.HANGING_WORDS}")
+    elif world_poses.slope_sigma_rad > _GOOD_SLOPE_RAD and (
+        words := resting_ball.slope_words(problem)
+    ):
         weak.append(f"for the floor's slope, {words}")
     return tuple(weak)
 
@@ -326,7 +328,7 @@ def _problem(
             "no camera saw the ball rest on the mark; put it there and leave the booth for the "
             "two seconds that this step takes"
         )
-    refusals.check_front(resting_places(resting, poses))
+    resting_ball.check_front(resting_places(resting, poses))
     heights_m = {
         place: height_m for place in resting if (height_m := raised_height_m(place)) is not None
     }
@@ -337,7 +339,7 @@ def _problem(
         if spread < _MIN_SPREAD_M:
             raise CalibrationError(
                 "no camera saw enough of the floor, and the ball did not lie on it at three "
-                f"places that form a triangle: {refusals.AROUND_WORDS}"
+                f"places that form a triangle: {resting_ball.AROUND_WORDS}"
             )
     problem = Problem(
         cameras, reference, radius_m, waved, resting, surfaces, Widths.widest(cameras), heights_m,
