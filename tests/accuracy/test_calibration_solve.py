@@ -378,8 +378,16 @@ def test_a_floor_that_slopes_is_not_taken_for_a_hook_that_moved() -> None:
 
 def test_a_hook_that_moved_is_refused(procedure: VirtualProcedure) -> None:
     booth = procedure.booth
-    with pytest.raises(CalibrationError, match=r"hanging ball's places are (18|19|20|21) mm"):
+    hung = _MovedHook(booth, hanging=True)
+    long_s = np.linspace(0.0, 600.0, 20_000).tolist()
+    upper_m, lower_m = (
+        np.mean([hung.resting_m(step, time_s)[:2] for time_s in long_s], axis=0)
+        for step in ("hanging-1800", "hanging-700")
+    )
+    with pytest.raises(CalibrationError, match=r"hanging ball's places are \d+ mm from") as refused:
         solved(booth.rig, _hanging(booth, _MovedHook))
+    told_mm = int(re.findall(r"places are (\d+) mm", str(refused.value))[0])
+    assert told_mm == pytest.approx(1e3 * np.linalg.norm(upper_m - lower_m), abs=1.5)
 
 
 def test_a_ball_of_another_radius_is_refused(

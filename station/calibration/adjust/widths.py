@@ -30,15 +30,15 @@ _ENDS: Mapping[str, tuple[float, float]] = {
     CENTER: (0.2, 2.0),
     K1: (2e-3, 4e-2),
     FLATTENING: (3e-4, 1e-2),
-    RADIUS: (1e-3, 3e-3),
+    RADIUS: (8e-4, 3e-3),
     BOW: (0.1, 1.0),
 }
 """Standard deviations of sound units and of poor ones. Gain (relative): Kinects differ by some
 0.03 %, the one of Khoshelham & Elberink (2012) was off by 0.2 %. Focal length (relative), centre
 (px) and k1: what a checkerboard calibration repeats to, and what units differ by (Herrera, Kannala
 & Heikkila 2012; Smisek, Jancosek & Pajdla 2011). Flattening (relative): a turned ball, and one made
-for play. Radius (relative): 1 mm of a circumference of 63 cm, which a tape shows, is 0.16 %. Bow: a
-share of ``BOW_TOLERANCE``."""
+for play. Radius (relative): half a millimetre of a circumference of 63 cm, as a tape shows it, is
+0.08 %. Bow: a share of ``BOW_TOLERANCE``."""
 _CAREFUL = {FOCAL: 5e-5, CENTER: 0.03, K1: 3e-4}
 """Standard deviations of a lens that was measured with care: what hundreds of images of a
 checkerboard repeat to."""
