@@ -1,5 +1,6 @@
 """The solution on detections drawn from the sensor's own noise: poses, honesty, refusals."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -387,7 +388,8 @@ def test_a_hook_that_moved_is_refused(procedure: VirtualProcedure) -> None:
     with pytest.raises(CalibrationError, match=r"hanging ball's places are \d+ mm from") as refused:
         solved(booth.rig, _hanging(booth, _MovedHook))
     told_mm = int(re.findall(r"places are (\d+) mm", str(refused.value))[0])
-    assert told_mm == pytest.approx(1e3 * np.linalg.norm(upper_m - lower_m), abs=1.5)
+    # A part of it, by which an ordinary floor slopes along the 1.1 m, may be the floor's.
+    assert -4.0 < told_mm - 1e3 * np.linalg.norm(upper_m - lower_m) < 1.0
 
 
 def test_a_ball_of_another_radius_is_refused(
