@@ -3,7 +3,7 @@ cameras see them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,12 +64,6 @@ def measured_height(
         else:
             break
     return height_m
-
-
-def listed_heights(steps: Iterable[str]) -> str:
-    """The heights (m) of some steps, in words."""
-    heights_m = sorted(raised_height_m(step) or 0.0 for step in steps)
-    return " and ".join(f"{height_m:g}" for height_m in heights_m)
 
 
 def recorded_heights(recordings: Path) -> list[tuple[str, float]]:

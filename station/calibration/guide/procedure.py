@@ -22,19 +22,19 @@ from station.calibration.detect.detections import (
     STAND,
     WALL,
     BallDetection,
+    raised_height_m,
     raised_step,
 )
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.heights import (
     HOOK,
-    listed_heights,
     measured_height,
     out_of_sight,
     recorded_heights,
     wrong_height,
 )
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.session import SESSION, Session
+from station.calibration.guide.session import SESSION, Session, listed
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
     coverage_so_far,
@@ -290,12 +290,12 @@ class Procedure:
         session, balls = self._see_at_rest(step)
         if words := wrong_height(session, step, balls, self.config.reference):
             return words
-        before = session.raised
+        before = {place: raised_height_m(place) or 0.0 for place in session.raised}
         session.record_resting(step, balls)
         if again and (others := [place for place in session.raised if place != step]):
             session.forget_raised(others)
-        if gone := set(before) - set(session.raised):
-            self.guide.say(f"this replaces the ball that was seen at {listed_heights(gone)} m")
+        if gone_m := sorted(before[place] for place in before.keys() - set(session.raised)):
+            self.guide.say(f"this replaces the ball that was seen at {listed(gone_m)} m")
         return None
 
     def _ask_for_the_other(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -198,10 +198,10 @@ class Session:
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
             f"{self.around_count} places around it": bool(self.around_count),
-            f"the ball hanging at {_listed(self.raised_as(HANGING))} m": bool(
+            f"the ball hanging at {listed(self.raised_as(HANGING).values())} m": bool(
                 self.raised_as(HANGING)
             ),
-            f"the ball on a stand at {_listed(self.raised_as(STAND))} m": bool(
+            f"the ball on a stand at {listed(self.raised_as(STAND).values())} m": bool(
                 self.raised_as(STAND)
             ),
             f"the board at {self.wall_count} of its places": self.done(WALL),
@@ -391,5 +391,6 @@ def _lens(document: Mapping[str, Any]) -> Lens:
     return Lens(K.tolist(), distortion.tolist())
 
 
-def _listed(heights_m: Mapping[str, float]) -> str:
-    return " and ".join(f"{height_m:g}" for height_m in heights_m.values())
+def listed(heights_m: Iterable[float]) -> str:
+    """Heights (m) in words."""
+    return " and ".join(f"{height_m:g}" for height_m in heights_m)

@@ -90,7 +90,6 @@ def run(config_path: Path, step: str, new: bool) -> None:
     store = CalibrationStore(config.calibrate.folder, config.calibration)
     guide = PageGuide(recordings is None, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)
-    kept = "kept, and not in use yet: the computation puts it into use"
     with store.locked():
         if new:
             store.set_aside()
@@ -112,7 +111,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "solve":
                 procedure.solve()
     if step not in ("all", "solve"):
-        guide.say(kept)
+        guide.say("kept, and not in use yet: the computation puts it into use")
 
 
 def main() -> int:
