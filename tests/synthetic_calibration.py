@@ -31,10 +31,11 @@ from station.calibration.detect.detections import (
 )
 from station.calibration.detect.planes import mean_share
 from station.calibration.detect.swing import LOOK_S, whole_swings
+from station.core.depth.correction import DepthCorrection
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import ROUNDING, SQUARE_ERROR
 from station.core.lens import pixel_rays, project
-from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.core.rig import CameraCalibration, Rig
 from station.simulation import violations
 from station.simulation.noise import UnitError
 from station.simulation.procedure import VirtualProcedure

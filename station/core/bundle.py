@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import image_of_png, png_of, png_size
+from station.core.depth.png import image_of_png, png_of, png_size
 from station.core.errors import BundleError, CalibrationError
 from station.core.files import private_folder, read_json, read_regular, write_json
 from station.core.rig import Rig

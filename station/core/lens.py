@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import DepthField
+from station.core.depth.correction import DepthCorrection
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
 from station.core.geometry import is_rigid
@@ -22,10 +22,6 @@ FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
 MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
-POLYNOMIAL, FIELD = "inverse-depth-poly", "inverse-depth-field"
-"""Models of depth correction, beside "none"."""
-_MAX_COEFFICIENTS = 16
-"""The solution uses five; powers beyond cannot be told from rounding."""
 _ZERO = 1e-6
 """Largest size of what is 0 in K but for rounding."""
 _FOCAL_RATIO = 3.0
@@ -34,71 +30,8 @@ _MAX_DISTORTION = 1e3
 _FARTHEST_M = 100.0
 """A booth is a room."""
 _LARGEST_ERROR_M, _LARGEST_ERROR_RAD = 1.0, float(np.pi)
-_DEPTHS_M = np.linspace(0.5, 4.0, 36)
-"""At which a correction must leave readings: a booth's."""
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class DepthCorrection:
-    """A camera's systematic depth error, z in metres.
-
-    1/z_true = sum_i a_i (1/z_measured)^i + g . (x, y) + f(x, y, 1/z_measured), with x and y from
-    -1 to 1 over the image's width and height and a smooth field f.
-    """
-
-    coefficients: tuple[float, ...] = ()
-    """(a0, a1, ...); empty = no correction."""
-    image_gradient: tuple[float, float] = (0.0, 0.0)
-    """(gx, gy), 1/m: change of the error from the image's middle to its edges."""
-    field: DepthField | None = None
-
-    def apply(self, depth_m: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-        """Corrected depths, same shape and type; 0 (no reading) stays 0.
-
-        Where there is an image gradient or a field, depth_m must be a whole image (h, w).
-        """
-        if not self.coefficients:
-            return depth_m
-        seen = depth_m > 0
-        inverse = 1.0 / np.where(seen, depth_m, 1.0)
-        corrected = np.polynomial.polynomial.polyval(inverse, self.coefficients)
-        if any(self.image_gradient):
-            height, width = depth_m.shape
-            gx, gy = self.image_gradient
-            corrected = corrected + gx * np.linspace(-1.0, 1.0, width, dtype=np.float32)
-            corrected += gy * np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
-        if self.field is not None:
-            corrected = corrected + self.field.over(np.asarray(inverse, np.float32))
-        # A correction extrapolated beyond its depths must not give points behind the camera.
-        usable = seen & (corrected > 0)
-        return np.where(usable, 1.0 / np.where(usable, corrected, 1.0), 0.0).astype(depth_m.dtype)
-
-    def inverse_at(self, inverse: Array, x: Array, y: Array) -> Array:
-        """Corrected inverse depths (n,) of measured ones at image positions x, y from -1 to 1."""
-        if not self.coefficients:
-            return inverse
-        corrected = np.polynomial.polynomial.polyval(inverse, self.coefficients)
-        corrected = corrected + self.image_gradient[0] * x + self.image_gradient[1] * y
-        if self.field is not None:
-            corrected = corrected + self.field.at(inverse, x, y)
-        return np.asarray(corrected)
-
-    def to_json(self) -> dict[str, Any]:
-        if not self.coefficients:
-            return {"model": "none"}
-        document: dict[str, Any] = {
-            "model": POLYNOMIAL,
-            "coefficients": list(self.coefficients),
-        }
-        if any(self.image_gradient):
-            document["image_gradient"] = list(self.image_gradient)
-        if self.field is not None:
-            document["model"] = FIELD
-            document["inverse_depth_per_m"] = list(self.field.knots)
-            document["control_per_m"] = self.field.control.tolist()
-        return document
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +242,13 @@ def _intrinsics(name: str, K: Array, width: int, height: int) -> Array:
     return K
 
 
+def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
+    try:
+        return DepthCorrection.from_json(fields)
+    except ValueError as cause:
+        raise ValueError(f"camera {name}: {cause}") from None
+
+
 def _covariance(
     name: str, fields: Mapping[str, Any], matrix: Callable[[str, tuple[int, ...]], Array]
 ) -> Array | None:
@@ -319,32 +259,3 @@ def _covariance(
     if np.abs(found - found.T).max() > 1e-6 * scale or np.linalg.eigvalsh(found)[0] < -1e-6 * scale:
         raise ValueError(f"camera {name}: covariance is not symmetric and positive")
     return found
-
-
-def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
-    model = fields.get("model")
-    if model == "none":
-        return DepthCorrection()
-    if model in (POLYNOMIAL, FIELD):
-        coefficients = tuple(float(value) for value in fields["coefficients"])
-        usable = 0 < len(coefficients) <= _MAX_COEFFICIENTS and np.isfinite(coefficients).all()
-        _expect(
-            usable, name, f"depth_correction needs 1 to {_MAX_COEFFICIENTS} finite coefficients"
-        )
-        gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
-        usable = len(gradient) == 2 and np.isfinite(gradient).all()
-        _expect(usable, name, "image_gradient must be two finite numbers")
-        try:
-            field = DepthField.from_json(fields) if model == FIELD else None
-        except ValueError as cause:
-            raise ValueError(f"camera {name}: {cause}") from None
-        correction = DepthCorrection(coefficients, (gradient[0], gradient[1]), field)
-        edges = np.array([-1.0, 0.0, 1.0])
-        inverse, x, y = (grid.ravel() for grid in np.meshgrid(1.0 / _DEPTHS_M, edges, edges))
-        left = (correction.inverse_at(inverse, x, y) > 0.0).any()
-        _expect(left, name, "depth_correction must leave readings between 0.5 and 4 m")
-        return correction
-    raise ValueError(
-        f"camera {name}: depth_correction model {model!r} is unknown "
-        f"(known: none, {POLYNOMIAL}, {FIELD})"
-    )

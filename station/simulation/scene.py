@@ -11,10 +11,11 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import ArrayLike, NDArray
 
+from station.core.depth.correction import DepthCorrection
 from station.core.errors import InputError
 from station.core.geometry import rigid, transform
 from station.core.lens import rays as lens_rays
-from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.core.rig import CameraCalibration, Rig
 from station.simulation.noise import BASELINE_M, TrueView
 
 Array = NDArray[np.float64]

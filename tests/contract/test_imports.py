@@ -19,6 +19,7 @@ PURE = (
     "station/core/lens.py",
 )
 PURE_FOLDERS = (
+    "station/core/depth",
     "station/calibration/detect",
     "station/calibration/adjust",
     "station/calibration/solve",

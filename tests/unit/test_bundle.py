@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
+from station.core.depth.correction import DepthCorrection
 from station.core.errors import BundleError, CalibrationError, FormatError
-from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.core.rig import CameraCalibration, Rig
 
 
 @pytest.fixture

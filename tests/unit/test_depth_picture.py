@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from station.console.live.picture import STRIDE_PX, PictureMaker
 from station.core.config import Volume
-from station.core.rig import CameraCalibration, DepthCorrection
+from station.core.depth.correction import DepthCorrection
+from station.core.rig import CameraCalibration
 
 _SHAPE = (480, 640)
 _PERSON, _WALL, _NOTHING, _FLOOR = (300, 320), (40, 60), (100, 600), (460, 320)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from station.core.depth_image import image_of_png, png_of, png_size
+from station.core.depth.png import image_of_png, png_of, png_size
 
 Writer = Callable[[NDArray[np.uint16]], bytes]
 RNG = np.random.default_rng(0)

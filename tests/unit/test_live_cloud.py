@@ -11,8 +11,9 @@ import pytest
 
 from station.booth.live import LiveCloud, frameset_points, is_empty
 from station.core.config import Volume
+from station.core.depth.correction import DepthCorrection
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
-from station.core.rig import CameraCalibration, DepthCorrection, Rig
+from station.core.rig import CameraCalibration, Rig
 from station.simulation.scene import Mesh, load_mesh
 from station.simulation.sensor import SimulatedBooth, VirtualCamera
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.rig import CameraCalibration, PredictedError
 
 Array = NDArray[np.float64]

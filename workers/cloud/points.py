@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import JUMP_RATIO, Image
+from station.core.depth.images import JUMP_RATIO, Image
 
 _NORMAL_REACH_PX = 2
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from station.core.bundle import Bundle
 from station.core.config import Volume
-from station.core.depth_image import Image, jumps
+from station.core.depth.images import Image, jumps
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m

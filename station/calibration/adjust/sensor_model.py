@@ -4,7 +4,7 @@ Inverse depth: 1/z_true = w + p0 + p1 w + p2 (w - w0)^2 + p3 x + p4 y + p5 L(w) 
 w = 1/z_measured and x, y from -1 to 1 over the image. p0 is a shift of the disparity, p1 a wrong
 baseline, p3 and p4 a projector that is turned against its camera, p5 L a share of the difference
 between two laws by which raw readings become depths; f is a smooth field of tensor
-B-splines (`station.core.depth_image`) with a Gaussian-process prior. Lens: the focal length's
+B-splines (`station.core.depth.field`) with a Gaussian-process prior. Lens: the focal length's
 relative error, the principal point's shift (pixels) and the radial coefficient k1. Ball: how much
 flatter the side of it that the camera sees is than a sphere, a share of its radius.
 """
@@ -18,9 +18,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import DepthField, linear_basis, quadratic_basis
+from station.core.depth.correction import DepthCorrection
+from station.core.depth.field import DepthField, linear_basis, quadratic_basis
 from station.core.kinect_v1 import registration_law
-from station.core.rig import CameraCalibration, DepthCorrection
+from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -209,7 +210,7 @@ class SensorModel:
 
 @numba.njit(cache=True, nogil=True)
 def _add_field(total, inverse, place, knots, control):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the field's values (n,); see ``station.core.depth_image``, whose bases these are."""
+    """Add the field's values (n,); see ``station.core.depth.field``, whose bases these are."""
     layers, rows, columns = control.shape
     for n in range(len(inverse)):
         k = 0

@@ -16,8 +16,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.depth.correction import DepthCorrection
 from station.core.errors import FormatError
-from station.core.rig import CameraCalibration, DepthCorrection
+from station.core.rig import CameraCalibration
 from station.sensors.base import DeviceInfo
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.detections import FLOOR, PlaneObservation
-from station.core.depth_image import Image, inverse_depth, jumps
+from station.core.depth.images import Image, inverse_depth, jumps
 from station.core.kinect_v1 import FROZEN_SHARE, RANDOM_SIGMA, ROUNDING, SQUARE_ERROR
 from station.core.lens import rays
 from station.core.rig import CameraCalibration

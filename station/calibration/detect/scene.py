@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth_image import Image, inverse_depth
+from station.core.depth.images import Image, inverse_depth
 from station.core.errors import FormatError
 from station.core.files import write_bytes
 from station.core.rig import MAX_PIXELS

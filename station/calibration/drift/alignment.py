@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from station.calibration.drift.motion import LEVER_M, MIN_SHARE, CameraMove
 from station.calibration.drift.reference import COMMON, LOCAL, DriftReference
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.geometry import invert, se3_exp, transform
 from station.core.lens import project
 

@@ -18,7 +18,7 @@ from station.calibration.detect.scene import raw_inverse_depth, smoothed
 from station.calibration.drift.alignment import Alignment, align
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import BLOCK, DriftReference
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 
 Array = NDArray[np.float64]
 

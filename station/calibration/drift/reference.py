@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import SMOOTHING_PX, StaticView, smoothed
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.geometry import skew
 from station.core.lens import rays
 from station.core.rig import CameraCalibration

@@ -16,7 +16,7 @@ from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"

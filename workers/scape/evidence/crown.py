@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from station.core.depth_image import Image
+from station.core.depth.images import Image
 from station.core.geometry import invert, transform
 from station.core.lens import project
 from workers.cloud.observed import CameraView
