@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from running_station import STATION, Station
 
-from station.core.config import BoothConfig, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import load_config
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 

@@ -12,7 +12,7 @@ import httpx
 from running_station import Station
 
 from station.console.security.vault import SCOPES, Scope, Vault
-from station.core.config import load_config
+from station.core.config_file import load_config
 
 PASSWORD = "correct horse battery"
 API = "/api/v1"

@@ -10,7 +10,7 @@ import click
 from station.administration import units
 from station.administration.archive import check, save
 from station.core.commands import config_option
-from station.core.config import find_config, load_config
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 
 

@@ -13,7 +13,7 @@ from station.administration.booth_file import CONFIG, STATE_FOLDER, administrati
 from station.administration.migrate import migrate
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.core.commands import config_option
-from station.core.config import find_config, load_config
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError, ConfigError
 
 

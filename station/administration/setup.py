@@ -31,7 +31,8 @@ from station.administration.connected import (
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.console.security.vault import Vault
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.drivers import CameraConfig
 from station.core.errors import BoothError, ConfigError, DriverError
 from station.core.files import write_bytes

@@ -12,7 +12,7 @@ import click
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.core.commands import config_option
-from station.core.config import find_config, load_config
+from station.core.config_file import find_config, load_config
 from station.core.spool import Spool
 
 _limit_option = click.option(

@@ -12,7 +12,8 @@ import click
 import zmq
 
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import DriverError, FormatError
 from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.messages import CameraHealth, DesiredState, FrameHeader, SensorInfo

@@ -43,7 +43,8 @@ from station.booth.session import (
     state_of,
 )
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
 from station.core.scans import ScanId, ScanNote, boot_id, failure_reason, scan_id_of

@@ -16,7 +16,8 @@ from station.archive.tables import printed_table, read_measurements
 from station.booth.health import booth_health, reports
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import new_scan_id, scan_id_of

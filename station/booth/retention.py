@@ -20,7 +20,8 @@ import click
 
 from station.archive.index import ScanIndex
 from station.core.commands import config_option
-from station.core.config import RetentionConfig, find_config, load_config
+from station.core.config import RetentionConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import held, read_bounded_json, write_bytes
 from station.core.scans import STATES, ScanId, boot_id, scan_id_of

@@ -20,7 +20,8 @@ from pathlib import Path
 import click
 
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import held, private_folder
 from station.core.service import die_with_parent, file_name, stop_event

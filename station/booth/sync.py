@@ -22,7 +22,8 @@ from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import NOBODY
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.rig import Rig
 from station.core.scans import ScanId, scan_id_of

@@ -10,7 +10,8 @@ import click
 from station.console.security.certificate import make_certificate
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.commands import Number, config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.service import return_freed_memory, set_up_logs, stop_event
 
 

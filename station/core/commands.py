@@ -21,7 +21,7 @@ from station.core.service import set_up_caches
 config_option = click.option(
     "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
 )
-"""The configuration; without it `station.core.config.find_config` chooses."""
+"""The configuration; without it `station.core.config_file.find_config` chooses."""
 _OPTIONAL = {
     "open3d": "this command needs open3d, which is not part of the basic installation: apt "
     "install body-booth-simulation, "

@@ -13,7 +13,8 @@ import click
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError, SpoolError
 from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool

@@ -27,7 +27,7 @@ from station.archive.smis import seamly_name, smis
 from station.archive.surfaces import Surface, aligned, distances
 from station.archive.tables import csv_table, read_measurements, rows
 from station.archive.terms import TERMS, plain_name, split_side
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.geometry import so3_exp
 from station.core.service import set_up_logs
 from station.core.spool import Spool

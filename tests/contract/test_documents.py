@@ -16,7 +16,7 @@ import pytest
 
 from station.booth.supervisor import services
 from station.cli import station
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.messaging.topics import TOPICS
 from workers.cli import reconstruct
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import ConfigError
 from station.messaging.messages import DesiredState, FrameHeader
 from station.messaging.transport import publisher, subscriber

@@ -14,7 +14,7 @@ import pytest
 from station.administration import booth_file
 from station.booth.supervisor import services
 from station.cli import COMMANDS as STATION
-from station.core.config import load_config
+from station.core.config_file import load_config
 from workers.cli import COMMANDS as RECONSTRUCT
 
 ROOT = Path(__file__).parents[2]

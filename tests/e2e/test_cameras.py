@@ -18,7 +18,7 @@ from running_station import Station
 
 from station.booth.health import booth_health
 from station.booth.supervisor import services
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import BoothError, DriverError
 from station.core.files import held
 from station.core.service import read_health

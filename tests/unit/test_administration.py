@@ -19,7 +19,7 @@ from station.administration.migrate import MIGRATIONS, VERSION, migrate
 from station.administration.restore import restore
 from station.administration.setup import compare_sensors, setup
 from station.core import bundle, rig
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import BoothError, ConfigError, FormatError
 from station.core.rig import Rig
 from station.sensors.freenect import FreenectCamera

@@ -18,7 +18,7 @@ from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.messaging.messages import CameraHealth
 from station.messaging.transport import publisher
 

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from station.booth.health import booth_health
-from station.core.config import BoothConfig, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import load_config
 from station.core.service import HEALTH, file_name
 
 _CAMERAS = ("a", "b")

@@ -18,7 +18,8 @@ from station.calibration.drift.motion import LEVER_M
 from station.calibration.drift.people import ENOUGH, Evidence, find_drift
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
-from station.core.config import BoothConfig, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import load_config
 from station.core.errors import CalibrationError
 from station.core.geometry import se3_exp
 from station.core.rig import Rig

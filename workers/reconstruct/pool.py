@@ -20,7 +20,8 @@ from typing import Any
 import click
 
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.files import private_folder, write_json
 from station.core.scans import ScanId
 from station.core.service import Heartbeat, return_freed_memory, set_up_logs, stop_event

@@ -18,7 +18,8 @@ from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
 from station.core.commands import config_option
-from station.core.config import BoothConfig, find_config, load_config
+from station.core.config import BoothConfig
+from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
 

@@ -12,7 +12,7 @@ import click
 from station.calibration.detect.detections import HANGING, RAISED_M, STAND
 from station.calibration.guide.operator import Guide
 from station.core.commands import Number, config_option
-from station.core.config import find_config, load_config
+from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
 
 # The rest is imported after the first words: compiled code takes most of a second to load, and

@@ -14,7 +14,7 @@ from station.calibration.detect.detections import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.store import CalibrationStore
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import BoothError
 
 STEPS = ("all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve")

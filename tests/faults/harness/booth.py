@@ -29,7 +29,7 @@ sys.path.append(str(INSIDE))  # the driver that the configurations name
 
 from station.booth.health import MAX_AGE_S, booth_health  # noqa: E402
 from station.cli import station as station_command  # noqa: E402
-from station.core.config import load_config  # noqa: E402
+from station.core.config_file import load_config  # noqa: E402
 from station.core.errors import BoothError  # noqa: E402
 
 WAIT_S = 90.0

@@ -26,7 +26,7 @@ from table import Row
 
 from station.archive.surfaces import read_mesh
 from station.core.bundle import read_bundle
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.rig import Rig
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from station.core.config import load_config
+from station.core.config_file import load_config
 from station.core.errors import ConfigError
 
 _CAMERA = """
