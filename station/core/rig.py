@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.correction import DepthCorrection
+from station.core.depth.intrinsics import check_intrinsics
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
 from station.core.geometry import is_rigid
@@ -22,11 +23,6 @@ FORMAT = "booth-calibration"
 VERSIONS = frozenset({1})
 MAX_PIXELS = 4096
 """On a side of a depth image; no depth sensor has more."""
-_ZERO = 1e-6
-"""Largest size of what is 0 in K but for rounding."""
-_FOCAL_RATIO = 3.0
-"""Pixels that were merged along one side of the image are twice as long as wide."""
-_MAX_DISTORTION = 1e3
 _FARTHEST_M = 100.0
 """A booth is a room."""
 _LARGEST_ERROR_M, _LARGEST_ERROR_RAD = 1.0, float(np.pi)
@@ -209,44 +205,24 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
     whole = sizes == (fields["width"], fields["height"])
     possible = whole and 0 < min(sizes) <= max(sizes) <= MAX_PIXELS
     _expect(possible, name, f"width and height must be whole numbers from 1 to {MAX_PIXELS}")
-    distortion = matrix("distortion", (5,))
-    straight = (np.abs(distortion) <= _MAX_DISTORTION).all()
-    _expect(straight, name, f"distortion must lie within {_MAX_DISTORTION:g} of 0")
+    K, distortion = matrix("K", (3, 3)), matrix("distortion", (5,))
+    try:
+        check_intrinsics(K, distortion, width, height)
+        correction = DepthCorrection.from_json(fields["depth_correction"])
+    except ValueError as cause:
+        raise ValueError(f"camera {name}: {cause}") from None
     return CameraCalibration(
         name=name,
         serial=str(fields["serial"]),
         model=str(fields["model"]),
         width=width,
         height=height,
-        K=_intrinsics(name, matrix("K", (3, 3)), width, height),
+        K=K,
         distortion=distortion,
-        depth_correction=_correction(name, fields["depth_correction"]),
+        depth_correction=correction,
         world_from_camera=pose,
         covariance=_covariance(name, fields, matrix),
     )
-
-
-def _intrinsics(name: str, K: Array, width: int, height: int) -> Array:
-    """K, whose other terms no reader of it looks at, if it is that of a camera of this size."""
-    (fx, _, cx), (_, fy, cy), _ = K
-    others = K - ((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
-    near, far = min(fx, fy), max(fx, fy)
-    beside = -width <= cx <= 2 * width and -height <= cy <= 2 * height
-    for met, words in (
-        (near > 1.0, "positive focal lengths, beyond 1 pixel"),
-        (far <= _FOCAL_RATIO * near, f"fx and fy within a factor of {_FOCAL_RATIO:g}"),
-        (beside, "its centre less than an image's size away from the image"),
-        (np.abs(others).max() < _ZERO, "the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
-    ):
-        _expect(met, name, f"K must have {words}")
-    return K
-
-
-def _correction(name: str, fields: Mapping[str, Any]) -> DepthCorrection:
-    try:
-        return DepthCorrection.from_json(fields)
-    except ValueError as cause:
-        raise ValueError(f"camera {name}: {cause}") from None
 
 
 def _covariance(

@@ -23,6 +23,7 @@ SPEAKERS = (
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
     "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",
     "station/booth/retention.py", "station/core/spool.py", "station/messaging/transport.py",
+    "station/core/depth/intrinsics.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
     "station/calibration/drift/people.py",
     "station/calibration/guide/procedure.py", "station/calibration/guide/heights.py",

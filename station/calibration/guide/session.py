@@ -36,6 +36,7 @@ from station.calibration.detect.detections import (
     raised_height_m,
 )
 from station.calibration.detect.scene import StaticView
+from station.core.depth.intrinsics import check_intrinsics
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import fsync_folder, private_folder, read_json, write_json
 from station.core.rig import CameraCalibration, Rig
@@ -335,7 +336,7 @@ class Session:
                 self._check_camera(str(name))
                 self.lenses.pop(str(name), None)
                 if lens is not None:
-                    self.lenses[str(name)] = _lens(lens)
+                    self.lenses[str(name)] = _lens(lens, self.cameras[str(name)])
         elif step != EMPTY and not step.startswith(WALL):
             raise ValueError(f"there is no step {step}")
         else:
@@ -378,16 +379,15 @@ class Session:
         return self._later_s
 
 
-def _lens(document: Mapping[str, Any]) -> Lens:
+def _lens(document: Mapping[str, Any], camera: CameraCalibration) -> Lens:
     """Intrinsics of the journal.
 
     Raises:
-        ValueError: they are of no lens.
+        ValueError: the camera cannot have such a lens.
     """
     K = finite_numbers(document["K"], (3, 3))
     distortion = finite_numbers(document["distortion"], (5,))
-    if min(K[0, 0], K[1, 1]) <= 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
-        raise ValueError("K has focal lengths above 0, and the last row 0, 0, 1")
+    check_intrinsics(K, distortion, camera.width, camera.height)
     return Lens(K.tolist(), distortion.tolist())
 
 

@@ -1,3 +1,3 @@
-"""A depth camera's images: where they jump, their systematic error, their files.
+"""A depth camera: lenses that are possible, jumps in its images, their systematic error and files.
 Pure mathematics and bytes: of the station it imports nothing.
 """
