@@ -18,18 +18,13 @@ from station.calibration.adjust.problem import Sightings
 from station.calibration.adjust.sensor_model import COARSE, image_place
 from station.calibration.detect.ball_image import ball_inverse_depth
 from station.calibration.detect.detections import (
-    AROUND,
-    BALL,
     FLOOR,
-    FRONT,
-    HANGING,
-    MARK,
-    RAISED,
     BallDetection,
     Observations,
     PlaneObservation,
 )
 from station.calibration.detect.planes import mean_share
+from station.calibration.detect.step_names import AROUND, BALL, FRONT, HANGING, MARK, RAISED
 from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.core.depth.correction import DepthCorrection
 from station.core.geometry import invert, se3_exp, transform

@@ -8,19 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.ball import find_ball
-from station.calibration.detect.detections import (
-    BALL,
-    EMPTY,
-    FRONT,
-    HANGING,
-    MARK,
-    PLACES,
-    BallDetection,
-    Observations,
-    PlaneObservation,
-)
+from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import static_view
+from station.calibration.detect.step_names import BALL, EMPTY, FRONT, HANGING, MARK, PLACES
 from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration

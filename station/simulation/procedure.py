@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.detections import (
+from station.calibration.detect.step_names import (
     AROUND,
     BALL,
     EMPTY,
@@ -20,6 +20,8 @@ from station.calibration.detect.detections import (
     MARK,
     PLACES,
     STAND,
+    WALL,
+    numbered_step,
     raised_height_m,
 )
 from station.core.errors import InputError
@@ -76,8 +78,8 @@ class VirtualProcedure:
     @property
     def steps(self) -> tuple[str, ...]:
         """All steps in their order."""
-        walls = (f"wall-{i}" for i in range(len(self.board_at_m)))
-        around = (f"{AROUND}-{i}" for i in range(len(self.around_m)))
+        walls = (numbered_step(WALL, i) for i in range(len(self.board_at_m)))
+        around = (numbered_step(AROUND, i) for i in range(len(self.around_m)))
         kind = HANGING if self.hanging else STAND
         raised = (f"{kind}-{round(1e3 * height)}" for height in self.raised_m)
         return (EMPTY, BALL, MARK, FRONT, *walls, *around, *raised)

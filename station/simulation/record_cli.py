@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from station.calibration.detect.detections import EMPTY
+from station.calibration.detect.step_names import EMPTY
 from station.core.commands import Number
 from station.core.errors import InputError
 from station.sensors.recording import RecordedFrame, write_recording

@@ -12,7 +12,8 @@ from calibrated_booths import FRONT, REFERENCE, pair_errors, reference_errors, s
 from numpy.typing import NDArray
 from scan_distortion import distortion
 
-from station.calibration.detect.detections import BALL, FLOOR, BallDetection, Observations
+from station.calibration.detect.detections import FLOOR, BallDetection, Observations
+from station.calibration.detect.step_names import BALL
 from station.calibration.solve import solution as solution_module
 from station.calibration.solve.solution import Solution, height_words
 from station.core.errors import CalibrationError

@@ -23,8 +23,9 @@ import synthetic_calibration as synthetic
 from station.calibration.adjust.equations import TREMOR_M
 from station.calibration.adjust.residuals import robust_weight
 from station.calibration.detect.ball import find_ball
-from station.calibration.detect.detections import BALL, EMPTY, BallDetection
+from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.scene import static_view
+from station.calibration.detect.step_names import BALL, EMPTY
 from station.calibration.solve.initial import sorted_detections
 from station.calibration.solve.pairwise import GATE_M
 from station.core.geometry import transform

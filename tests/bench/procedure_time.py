@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import patch
 
-from station.calibration.detect.detections import EMPTY, HANGING, RAISED
+from station.calibration.detect.step_names import EMPTY, HANGING, RAISED
 from station.calibration.detect.swing import LOOK_S
 from station.calibration.guide import procedure as guided
 from station.calibration.guide import steps

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from station.calibration.detect.detections import BALL, EMPTY, MARK
+from station.calibration.detect.step_names import BALL, EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, Session
 from station.calibration.guide.store import CalibrationStore
 from station.sensors.recording import RecordedFrame, write_recording

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.ball import find_ball
-from station.calibration.detect.detections import BALL, EMPTY, BallDetection, PlaneObservation
+from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
+from station.calibration.detect.step_names import BALL, EMPTY
 from station.core.errors import FormatError
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import EMPTY, MARK, BallDetection, PlaneObservation
+from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.scene import static_view
+from station.calibration.detect.step_names import EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, SENSORS, Lens, Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import CalibrationError, FormatError

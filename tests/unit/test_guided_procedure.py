@@ -12,7 +12,7 @@ from typing import cast
 import click
 import pytest
 
-from station.calibration.detect.detections import EMPTY
+from station.calibration.detect.step_names import EMPTY
 from station.calibration.guide import procedure
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure

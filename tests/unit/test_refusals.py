@@ -12,12 +12,8 @@ import pytest
 from station.calibration.adjust.problem import Doubt, Problem, State
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import (
-    FLOOR,
-    BallDetection,
-    Observations,
-    raised_height_m,
-)
+from station.calibration.detect.detections import FLOOR, BallDetection, Observations
+from station.calibration.detect.step_names import raised_height_m
 from station.calibration.solve import jumps, refusals, resting_ball
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import Detections, sorted_detections, without_gaps

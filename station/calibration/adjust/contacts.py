@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from station.calibration.adjust.ball_shape import SHAPE, shape_terms
 from station.calibration.adjust.problem import BOW_SIZE, Indices, Layout, Problem, State
-from station.calibration.detect.detections import FLOOR, HANGING
+from station.calibration.detect.detections import FLOOR
+from station.calibration.detect.step_names import HANGING
 from station.core.geometry import level_axes
 
 Array = NDArray[np.float64]

@@ -23,19 +23,6 @@ from station.sensors.base import DeviceInfo
 
 Array = NDArray[np.float64]
 
-EMPTY, BALL, MARK, FRONT, WALL, AROUND, STAND, HANGING = (
-    "empty", "ball", "mark", "front", "wall", "around", "stand", "hanging",
-)  # fmt: skip
-"""Steps of a calibration; those with several places are numbered: "around-0", "wall-1", and
-"stand-1700" and "hanging-1800" by the height in millimetres."""
-RAISED = (STAND, HANGING)
-"""Steps in which the ball is at a measured height: on a stand, or hanging from a hook."""
-HEIGHTS_M: Mapping[str, tuple[float, float]] = {STAND: (1.7, 0.9), HANGING: (1.8, 0.7)}
-"""Heights of the raised ball's underside that serve best, the upper one first."""
-RAISED_M = (0.3, 2.2)
-"""Heights of the raised ball that cameras of a booth see."""
-PLACES = (AROUND, *RAISED)
-"""Steps of the resting ball that may be repeated elsewhere."""
 FLOOR = "floor"
 _FEWEST_PATCHES = 3
 """Fewer do not make a plane."""
@@ -49,30 +36,6 @@ one."""
 _WHOLE_SIGMA_PER_M = 3.8e-5
 """A whole ball's radius R at the distance z is measured to k z^3 / R^2, as a share of R: from
 `station.calibration.detect.ball_image.normal_equations`, 1.4 to 2.6 m, balls of 70 to 100 mm."""
-
-
-def raised_height_m(step: str) -> float | None:
-    """Stated height of the raised ball in a step's name, metres; None: it is not raised there.
-
-    Raises:
-        ValueError: its name does not end with a height in millimetres, or with one out of sight.
-    """
-    kind, _, millimetres = step.partition("-")
-    if kind not in RAISED:
-        return None
-    height_m = 1e-3 * int(millimetres) if millimetres.isdecimal() else 0.0
-    if not RAISED_M[0] <= height_m <= RAISED_M[1] or step != raised_step(kind, height_m):
-        low, high = (1e3 * height for height in RAISED_M)
-        raise ValueError(
-            f"{step} does not end with the height of the ball's underside in millimetres, "
-            f"{low:.0f} to {high:.0f}, such as {kind}-1700"
-        )
-    return height_m
-
-
-def raised_step(kind: str, height_m: float) -> str:
-    """Name of the step in which the ball is at a height (STAND, HANGING)."""
-    return f"{kind}-{round(1e3 * height_m)}"
 
 
 def uncalibrated(name: str, info: DeviceInfo) -> CameraCalibration:

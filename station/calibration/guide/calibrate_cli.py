@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from station.calibration.detect.detections import HANGING, RAISED_M, STAND
+from station.calibration.detect.step_names import HANGING, RAISED_M, STAND
 from station.calibration.guide.operator import Guide
 from station.core.commands import Number, config_option
 from station.core.config_file import find_config, load_config
@@ -192,7 +192,7 @@ def mark(procedure: Procedure, front: bool) -> None:
       station calibrate mark
       station calibrate mark --front
     """
-    from station.calibration.detect.detections import FRONT, MARK
+    from station.calibration.detect.step_names import FRONT, MARK
 
     procedure.rest(FRONT if front else MARK)
 

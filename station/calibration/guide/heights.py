@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from station.calibration.detect.detections import (
+from station.calibration.detect.detections import BallDetection
+from station.calibration.detect.step_names import (
     HANGING,
     HEIGHTS_M,
     RAISED_M,
     STAND,
-    BallDetection,
+    kind_of,
     raised_height_m,
 )
 from station.calibration.guide.operator import Guide
@@ -79,7 +80,7 @@ def recorded_heights(recordings: Path) -> list[tuple[str, float]]:
         except ValueError as cause:
             raise CalibrationError(f"{folder} cannot be used: {cause}") from None
         if height_m is not None:
-            found.append((folder.name.partition("-")[0], height_m))
+            found.append((kind_of(folder.name), height_m))
     hung = sum(kind == HANGING for kind, _ in found)
     if hung > len(HEIGHTS_M[HANGING]):
         raise CalibrationError(

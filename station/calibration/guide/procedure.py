@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from station.calibration.detect.detections import (
+from station.calibration.detect.detections import BallDetection
+from station.calibration.detect.step_names import (
     AROUND,
     BALL,
     EMPTY,
@@ -21,7 +22,7 @@ from station.calibration.detect.detections import (
     RAISED_M,
     STAND,
     WALL,
-    BallDetection,
+    numbered_step,
     raised_height_m,
     raised_step,
 )
@@ -199,7 +200,7 @@ class Procedure:
         session = self._session_to_add_to()
         before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MAX_PLACES):
-            step = f"{AROUND}-{place}"
+            step = numbered_step(AROUND, place)
             if self.recordings is not None:
                 if (asked or place > before) and not (self.recordings / step).is_dir():
                     return
@@ -322,14 +323,14 @@ class Procedure:
         before = session.wall_count if live else 0
         for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
             if self.recordings is not None:
-                recorded = (self.recordings / f"{WALL}-{place}").is_dir()
+                recorded = (self.recordings / numbered_step(WALL, place)).is_dir()
                 if (asked or place > before) and not recorded:
                     return
                 if place == before:
                     self.guide.title("Flat board")
             elif not self._board_stands(place, first=place == before, asked=asked):
                 return
-            with self._feed(f"{WALL}-{place}") as (feed, session):
+            with self._feed(numbered_step(WALL, place)) as (feed, session):
                 look_at_wall(feed, session, self.guide, place)
 
     def _board_stands(self, place: int, *, first: bool, asked: bool) -> bool:

@@ -18,6 +18,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from station.calibration.detect.detections import (
+    BallDetection,
+    Observations,
+    PlaneObservation,
+    finite_numbers,
+)
+from station.calibration.detect.scene import StaticView
+from station.calibration.detect.step_names import (
     AROUND,
     BALL,
     EMPTY,
@@ -29,13 +36,9 @@ from station.calibration.detect.detections import (
     RAISED,
     STAND,
     WALL,
-    BallDetection,
-    Observations,
-    PlaneObservation,
-    finite_numbers,
+    kind_of,
     raised_height_m,
 )
-from station.calibration.detect.scene import StaticView
 from station.core.depth.intrinsics import check_intrinsics
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import fsync_folder, private_folder, read_json, write_json
@@ -327,7 +330,7 @@ class Session:
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
-        elif step.partition("-")[0] in PLACES:
+        elif kind_of(step) in PLACES:
             for other in self._replaced_by(step):
                 del self.around[other]
             self.around[step] = self._balls(entry)
@@ -349,7 +352,7 @@ class Session:
         height_m = raised_height_m(step)
         if height_m is None:
             return []
-        own = self.raised_as(step.partition("-")[0])
+        own = self.raised_as(kind_of(step))
         if step.startswith(HANGING) and len(own) == len(HEIGHTS_M[HANGING]):
             return list(own)
         return [other for other, its_m in own.items() if abs(its_m - height_m) < _SAME_HEIGHT_M]

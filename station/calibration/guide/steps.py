@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import HANGING, BallDetection, PlaneObservation
+from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import smoothed, static_view
+from station.calibration.detect.step_names import HANGING, WALL, numbered_step
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
@@ -75,7 +76,7 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
         CalibrationError: no camera sees a flat surface that was not there before.
     """
     taken = _still_frames(feed, session, guide, _WALL_FRAMES)
-    cameras, name = session.lensed_cameras(), f"wall-{place}"
+    cameras, name = session.lensed_cameras(), numbered_step(WALL, place)
     walls: list[PlaneObservation] = []
     for camera, (stack, scale_m) in taken.items():
         background = _background(session, camera)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from station.calibration.adjust.equations import bow_terms, corrected_centers
 from station.calibration.adjust.problem import Problem, Sightings, State, Surface, seen_shape
 from station.calibration.adjust.trajectory import TimeGrid, path_points
-from station.calibration.detect.detections import FLOOR, MARK, BallDetection, PlaneObservation
+from station.calibration.detect.detections import FLOOR, BallDetection, PlaneObservation
+from station.calibration.detect.step_names import MARK
 from station.calibration.solve.pairwise import GATE_M, Track
 from station.core.geometry import transform
 from station.core.lens import pixel_rays

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from station.calibration.adjust.contacts import PLUMB, contact_error_m, plumb_ends
 from station.calibration.adjust.problem import Problem, State
-from station.calibration.detect.detections import AROUND, FRONT, MARK
+from station.calibration.detect.step_names import AROUND, FRONT, MARK
 from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 

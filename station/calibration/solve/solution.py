@@ -22,15 +22,8 @@ from station.calibration.adjust.sensor_model import COARSE, SensorModel
 from station.calibration.adjust.trajectory import TimeGrid
 from station.calibration.adjust.widths import Widths
 from station.calibration.detect.coverage import Coverage
-from station.calibration.detect.detections import (
-    FLOOR,
-    FRONT,
-    HANGING,
-    MARK,
-    WALL,
-    Observations,
-    raised_height_m,
-)
+from station.calibration.detect.detections import FLOOR, Observations
+from station.calibration.detect.step_names import FRONT, HANGING, MARK, WALL, raised_height_m
 from station.calibration.solve import acceptance, refusals, resting_ball, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.initial import (

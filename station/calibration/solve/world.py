@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.adjust.problem import Layout, Problem, State, moved_state
-from station.calibration.detect.detections import FLOOR, FRONT, MARK
+from station.calibration.detect.detections import FLOOR
+from station.calibration.detect.step_names import FRONT, MARK
 from station.core.geometry import adjoint, invert, rigid, so3_log
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from station.calibration.detect.detections import FRONT, MARK
+from station.calibration.detect.step_names import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.store import CalibrationStore

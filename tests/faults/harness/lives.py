@@ -17,8 +17,9 @@ from unittest import mock
 
 import numpy as np
 
-from station.calibration.detect.detections import EMPTY, FRONT, MARK, BallDetection
+from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.scene import StaticView
+from station.calibration.detect.step_names import EMPTY, FRONT, MARK
 from station.calibration.guide.session import Lens, Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
