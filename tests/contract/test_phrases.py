@@ -29,6 +29,7 @@ SPEAKERS = (
     "station/calibration/guide/procedure.py", "station/calibration/guide/heights.py",
     "station/calibration/guide/steps.py",
     "station/calibration/guide/feed.py", "station/calibration/guide/session.py",
+    "station/calibration/guide/seen.py",
     "station/calibration/guide/store.py", "station/calibration/solve/refusals.py",
     "station/calibration/solve/resting_ball.py",
     "station/calibration/solve/solution.py", "station/calibration/solve/acceptance.py",

@@ -17,7 +17,7 @@ from station.calibration.detect.step_names import (
     raised_height_m,
 )
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.session import Session
+from station.calibration.guide.seen import Seen
 from station.core.errors import CalibrationError
 
 HOOK = (
@@ -90,22 +90,22 @@ def recorded_heights(recordings: Path) -> list[tuple[str, float]]:
 
 
 def wrong_height(
-    session: Session, step: str, balls: Sequence[BallDetection], reference: str
+    seen: Seen, step: str, balls: Sequence[BallDetection], reference: str
 ) -> str | None:
     """Words on a height that is decimetres from where the cameras, found so far, see the ball.
 
     It is known while the ball is still there, and not only with the solution. None where it is
     right, or too little of the waved ball was seen.
     """
-    if not session.balls:
+    if not seen.balls:
         return None
     from station.calibration.solve import solution
 
-    raised = set(session.raised)
-    laid = {place: seen for place, seen in session.around.items() if place not in raised}
+    raised = set(seen.raised)
+    laid = {place: there for place, there in seen.around.items() if place not in raised}
     return solution.height_words(
-        replace(session.observations(), around={**laid, step: balls}),
-        session.lensed_cameras(),
-        radius_m=session.radius_m,
+        replace(seen.observations(), around={**laid, step: balls}),
+        seen.lensed_cameras(),
+        radius_m=seen.radius_m,
         reference=reference,
     )

@@ -15,7 +15,8 @@ from station.calibration.detect.board import (
     find_board,
     judge_lens,
 )
-from station.calibration.guide.session import Lens, Session
+from station.calibration.guide.seen import Lens
+from station.calibration.guide.session import Session
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
 

@@ -35,7 +35,8 @@ from station.calibration.guide.heights import (
     wrong_height,
 )
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.session import SESSION, Session, listed
+from station.calibration.guide.seen import listed
+from station.calibration.guide.session import SESSION, Session
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
     coverage_so_far,

@@ -1,4 +1,4 @@
-"""A calibration that is being done: what was seen so far, on disk as it comes.
+"""A calibration that is being done: what is seen is put on disk as it comes, and read again.
 
 A folder with ``session.json``, ``sensors.json`` (the cameras as they come from the factory),
 ``observations.jsonl`` (one line for each finished step, one a second while the ball is waved) and
@@ -10,37 +10,29 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from station.calibration.detect.detections import (
     BallDetection,
-    Observations,
     PlaneObservation,
     finite_numbers,
 )
 from station.calibration.detect.scene import StaticView
 from station.calibration.detect.step_names import (
-    AROUND,
     BALL,
     EMPTY,
     FRONT,
-    HANGING,
-    HEIGHTS_M,
     MARK,
     PLACES,
-    RAISED,
-    STAND,
     WALL,
     kind_of,
-    raised_height_m,
 )
+from station.calibration.guide.seen import Lens, Seen
 from station.core.depth.intrinsics import check_intrinsics
-from station.core.errors import CalibrationError, FormatError
+from station.core.errors import FormatError
 from station.core.files import fsync_folder, private_folder, read_json, write_json
 from station.core.rig import CameraCalibration, Rig
 
@@ -49,10 +41,8 @@ VERSIONS = frozenset({1})
 SESSION, SENSORS = "session.json", "sensors.json"
 JOURNAL, SCENE = "observations.jsonl", "scene"
 
-Seen = TypeVar("Seen", BallDetection, PlaneObservation)
+Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
-_SAME_HEIGHT_M = 0.15
-"""Heights of the ball that are nearer to each other are a measurement and its correction."""
 _FORGET_RAISED = "forget-raised"
 _NO_ENTRY = (
     ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
@@ -62,34 +52,11 @@ _BETWEEN_RUNS_S = 10.0
 """Runs of waving are set this far apart, whatever their clocks said: these may have been reset."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """Intrinsics that a board gave, in place of the factory's."""
-
-    K: list[list[float]]
-    distortion: list[float]
-
-
-@dataclass(slots=True)
-class Session:
-    """Everything seen so far; made by ``begin`` or ``load``."""
+@dataclass(slots=True, kw_only=True)
+class Session(Seen):
+    """Everything seen so far, on disk; made by ``begin`` or ``load``."""
 
     folder: Path
-    started: str
-    """UTC, ISO 8601."""
-    radius_m: float
-    cameras: Mapping[str, CameraCalibration]
-    """As they come from the factory: lenses known, places not."""
-    mark: list[BallDetection] = field(default_factory=list)
-    front: list[BallDetection] = field(default_factory=list)
-    balls: list[BallDetection] = field(default_factory=list)
-    planes: dict[str, list[PlaneObservation]] = field(default_factory=dict)
-    """Step -> the surfaces seen in it."""
-    around: dict[str, list[BallDetection]] = field(default_factory=dict)
-    """Place -> the ball resting there: on the floor, on a stand, or hanging."""
-    lenses: dict[str, Lens] = field(default_factory=dict)
-    adds_to: str = ""
-    """Name of the stored calibration that was taken up again."""
     runs: int = 0
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
@@ -104,7 +71,7 @@ class Session:
         document = {"format": FORMAT, "version": 1, "started": started, "radius_m": radius_m}
         # Written last: a folder without it was never begun.
         write_json(folder / SESSION, document)
-        return cls(folder, started, radius_m, cameras)
+        return cls(started, radius_m, cameras, folder=folder)
 
     @staticmethod
     def note_origin(folder: Path, adds_to: str) -> None:
@@ -132,85 +99,10 @@ class Session:
             raise FormatError(
                 f"{path} cannot be used ({cause}); start again with station calibrate --new"
             ) from None
-        session = cls(folder, started, radius_m, sensors.cameras)
+        session = cls(started, radius_m, sensors.cameras, folder=folder)
         session.adds_to = str(document.get("adds_to", ""))
         session._replay_journal()
         return session
-
-    def check_cameras(self, cameras: Mapping[str, CameraCalibration]) -> None:
-        """Refuse to mix what two different sets of cameras have seen.
-
-        Raises:
-            CalibrationError: naming the camera that is another one, missing or new.
-        """
-        for name in {**self.cameras, **cameras}:
-            then = self.cameras[name].serial if name in self.cameras else None
-            now = cameras[name].serial if name in cameras else None
-            if then != now:
-                raise CalibrationError(
-                    f"camera {name} is {now or 'not configured'} now and was {then or 'not there'} "
-                    f"when this calibration was started ({self.started}); start again with "
-                    "station calibrate --new"
-                )
-
-    def check_radius(self, radius_m: float) -> None:
-        """Refuse to mix what was seen of two different balls.
-
-        Raises:
-            CalibrationError: the radius is another one.
-        """
-        if self.radius_m != radius_m:
-            raise CalibrationError(
-                f"the calibration that was started at {self.started} uses a ball with a radius of "
-                f"{self.radius_m:g} m, but booth.toml says {radius_m:g} m "
-                "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
-                "with station calibrate --new"
-            )
-
-    def lensed_cameras(self) -> dict[str, CameraCalibration]:
-        """The cameras, with the lenses that a board gave where it gave any."""
-        return {
-            name: camera
-            if (lens := self.lenses.get(name)) is None
-            else replace(camera, K=np.array(lens.K), distortion=np.array(lens.distortion))
-            for name, camera in self.cameras.items()
-        }
-
-    def observations(self) -> Observations:
-        """The observations that the calibration is solved from."""
-        planes = [plane for seen in self.planes.values() for plane in seen]
-        return Observations(self.balls, self.mark, self.front, planes, self.around)
-
-    def done(self, step: str) -> bool:
-        """True once a step is finished (waving never is: more of it always helps)."""
-        if step in (MARK, FRONT):
-            return bool(getattr(self, step))
-        if step == WALL:
-            return any(name.startswith(WALL) for name in self.planes)
-        return step in self.planes
-
-    @property
-    def waved_s(self) -> int:
-        """Seconds in which the waved ball was seen."""
-        return len({int(ball.time_s) for ball in self.balls})
-
-    def summary(self) -> str:
-        """Summary of the observations so far, for the operator."""
-        parts = {
-            "the empty booth": self.done(EMPTY),
-            f"{len(self.balls)} sightings of the waved ball": bool(self.balls),
-            "the ball on the mark": self.done(MARK),
-            "the ball in front of it": self.done(FRONT),
-            f"{self.around_count} places around it": bool(self.around_count),
-            f"the ball hanging at {listed(self.raised_as(HANGING).values())} m": bool(
-                self.raised_as(HANGING)
-            ),
-            f"the ball on a stand at {listed(self.raised_as(STAND).values())} m": bool(
-                self.raised_as(STAND)
-            ),
-            f"the board at {self.wall_count} of its places": self.done(WALL),
-        }
-        return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
 
     def background(self, camera: str) -> StaticView | None:
         """The empty booth as a camera sees it, if that was looked at."""
@@ -224,29 +116,6 @@ class Session:
         for camera, view in views.items():
             view.save(private_folder(self.folder / SCENE) / f"{camera}.npz")
         self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
-
-    @property
-    def around_count(self) -> int:
-        """Places on the floor around the mark at which the ball was seen."""
-        return sum(place.startswith(AROUND) for place in self.around)
-
-    @property
-    def raised(self) -> list[str]:
-        """Steps in which the ball was seen at a measured height."""
-        return [place for place in self.around if place.startswith(RAISED)]
-
-    def raised_as(self, kind: str) -> dict[str, float]:
-        """Steps in which the ball was on a stand, or hung (STAND, HANGING), and their heights."""
-        heights_m = {place: raised_height_m(place) for place in self.raised}
-        return {
-            place: height_m
-            for place, height_m in heights_m.items()
-            if height_m is not None and place.startswith(kind)
-        }
-
-    @property
-    def wall_count(self) -> int:
-        return sum(name.startswith(WALL) for name in self.planes)
 
     def record_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
         """A flat board at one place ("wall-0", "wall-1", ...)."""
@@ -331,7 +200,7 @@ class Session:
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
         elif kind_of(step) in PLACES:
-            for other in self._replaced_by(step):
+            for other in self.replaced_by(step):
                 del self.around[other]
             self.around[step] = self._balls(entry)
         elif step == "board":
@@ -346,21 +215,10 @@ class Session:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
 
-    def _replaced_by(self, step: str) -> list[str]:
-        """Places that the ball at a height replaces: the same height, measured wrongly; or both
-        at which it hung before, maybe from another hook."""
-        height_m = raised_height_m(step)
-        if height_m is None:
-            return []
-        own = self.raised_as(kind_of(step))
-        if step.startswith(HANGING) and len(own) == len(HEIGHTS_M[HANGING]):
-            return list(own)
-        return [other for other, its_m in own.items() if abs(its_m - height_m) < _SAME_HEIGHT_M]
-
     def _balls(self, entry: Mapping[str, Any]) -> list[BallDetection]:
         return self._known([BallDetection.from_json(ball) for ball in entry["balls"]])
 
-    def _known(self, seen: list[Seen]) -> list[Seen]:
+    def _known(self, seen: list[Observed]) -> list[Observed]:
         """The same, if all are of cameras of this calibration.
 
         Raises:
@@ -392,8 +250,3 @@ def _lens(document: Mapping[str, Any], camera: CameraCalibration) -> Lens:
     distortion = finite_numbers(document["distortion"], (5,))
     check_intrinsics(K, distortion, camera.width, camera.height)
     return Lens(K.tolist(), distortion.tolist())
-
-
-def listed(heights_m: Iterable[float]) -> str:
-    """Heights (m) in words."""
-    return " and ".join(f"{height_m:g}" for height_m in heights_m)

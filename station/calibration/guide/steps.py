@@ -16,6 +16,7 @@ from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whol
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
+from station.calibration.guide.seen import Seen
 from station.calibration.guide.session import Session
 from station.core.depth.images import Image
 from station.core.errors import CalibrationError
@@ -184,10 +185,10 @@ def _is_still(seen: list[BallDetection]) -> bool:
     return bool(np.median(away) < _RESTING_M)
 
 
-def coverage_so_far(session: Session, reference: str) -> Coverage:
+def coverage_so_far(seen: Seen, reference: str) -> Coverage:
     """Coverage of the booth by the waved ball so far."""
-    coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
-    for ball in session.balls:
+    coverage = Coverage(seen.lensed_cameras(), reference, seen.radius_m)
+    for ball in seen.balls:
         coverage.add(ball)
     return coverage
 

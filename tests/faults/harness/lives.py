@@ -20,7 +20,8 @@ import numpy as np
 from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.scene import StaticView
 from station.calibration.detect.step_names import EMPTY, FRONT, MARK
-from station.calibration.guide.session import Lens, Session
+from station.calibration.guide.seen import Lens
+from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
 from station.core.errors import FormatError
