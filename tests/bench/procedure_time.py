@@ -17,8 +17,8 @@ from unittest.mock import patch
 
 from station.calibration.detect.step_names import EMPTY, HANGING, RAISED
 from station.calibration.detect.swing import LOOK_S
+from station.calibration.guide import attempt, steps
 from station.calibration.guide import procedure as guided
-from station.calibration.guide import steps
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.core.config import CalibrateConfig
@@ -149,15 +149,15 @@ def procedure_seconds(*, extras: bool, hangs: bool = False) -> dict[str, float]:
             guided,
             look_at_empty_booth=operator.look(steps._EMPTY_FRAMES / FRAME_RATE_HZ),
             look_at_wall=operator.look(steps._WALL_FRAMES / FRAME_RATE_HZ),
-            rest_ball=rest,
             wave_ball=operator.look(wanted.waving_s),
             coverage_so_far=lambda *_: SimpleNamespace(enough=False),
         ),
+        patch.object(attempt, "rest_ball", rest),
         patch.multiple(
             Procedure,
-            _feed=_NoFeed,
-            _remark_on_ghosts=lambda *_: None,
-            _check_station=lambda _: None,
+            feed=_NoFeed,
+            remark_on_ghosts=lambda *_: None,
+            check_station=lambda _: None,
             unfinished_session=lambda _: next(sessions),
             solve=lambda _: operator.look(SOLVING_S)(),
         ),

@@ -14,9 +14,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from station.calibration.detect.board import Board
+from station.calibration.guide import raised_ball
+from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.calibrate_cli import calibrate
 from station.calibration.guide.operator import Guide
-from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import BoothError, CalibrationError
@@ -126,11 +127,11 @@ def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPa
     laid: list[tuple[str, str]] = []
     monkeypatch.setattr(Guide, "step", lambda _, title, *__, **___: laid.append(("", title)))
 
-    def see(_: Procedure, height_m: float, kind: str, **__: bool) -> None:
+    def see(_: Attempt, height_m: float, kind: str, **__: bool) -> None:
         laid[-1] = (f"{kind} {height_m:g}", laid[-1][1])
 
-    monkeypatch.setattr(Procedure, "_see_raised", see)
-    monkeypatch.setattr(Procedure, "_check_station", lambda _: None)
+    monkeypatch.setattr(raised_ball, "_see_and_keep", see)
+    monkeypatch.setattr(Attempt, "check_station", lambda _: None)
     done = _run(config, "stand", "--height", "1.7")
     assert done.exit_code == 0, done.output
     assert laid == [

@@ -13,9 +13,10 @@ import click
 import pytest
 
 from station.calibration.detect.step_names import EMPTY
-from station.calibration.guide import procedure
+from station.calibration.guide import attempt, procedure, raised_ball
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
+from station.calibration.guide.raised_ball import see_all_heights, see_height
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
@@ -46,12 +47,12 @@ def guided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Procedure, 
         looked.append(step)
         yield None, session
 
-    monkeypatch.setattr(Procedure, "_feed", no_feed)
-    monkeypatch.setattr(Procedure, "_check_station", lambda _: None)
+    monkeypatch.setattr(Procedure, "feed", no_feed)
+    monkeypatch.setattr(Procedure, "check_station", lambda _: None)
     monkeypatch.setattr(
         procedure, "look_at_wall", lambda _, own, __, place: own.record_wall(f"wall-{place}", [])
     )
-    monkeypatch.setattr(procedure, "rest_ball", lambda *_: [])
+    monkeypatch.setattr(attempt, "rest_ball", lambda *_: [])
     guide = Guide(attended=True, countdown_s=COUNTDOWN_S)
     config = cast(BoothConfig, SimpleNamespace(reference=next(iter(session.cameras))))
     begun = Procedure(config, store, None, guide)
@@ -126,7 +127,7 @@ def test_two_heights_of_the_ball_are_asked_for(
     _answers(monkeypatch, [hangs])
     monkeypatch.setattr(click, "prompt", lambda *_, **__: heights_m.pop(0))
     for _ in range(3):
-        begun.raised()
+        see_all_heights(begun)
     kind = "hanging" if hangs else "stand"
     assert looked == [f"{kind}-1700", f"{kind}-900"]
     assert session.raised == looked
@@ -149,7 +150,7 @@ def _raise(
 
     _answers(monkeypatch, [True])
     monkeypatch.setattr(click, "prompt", answer)
-    guided[0].raised(again=again)
+    see_all_heights(guided[0], again=again)
     return asked
 
 
@@ -208,9 +209,9 @@ def test_a_single_step_names_the_height_that_is_missing(
     """A calibration without it was used, and nothing said that the vertical was unknown."""
     begun, _, _ = guided
     unattended = replace(begun, guide=replace(begun.guide, attended=False))
-    unattended.raise_ball(0.75, "hanging")
+    see_height(unattended, 0.75, "hanging")
     assert "now about 1.8 m above the floor, from the same hook" in capsys.readouterr().out
-    unattended.raise_ball(1.8, "hanging")
+    see_height(unattended, 1.8, "hanging")
     assert "from the same hook" not in capsys.readouterr().out
 
 
@@ -223,7 +224,7 @@ def test_a_height_that_is_decimetres_off_is_asked_for_again(
     """It was told with the solution, when the ball had been taken down."""
     _, session, looked = guided
 
-    monkeypatch.setattr(procedure, "wrong_height", _wrong_at_1080)
+    monkeypatch.setattr(raised_ball, "_wrong_height", _wrong_at_1080)
     asked = _raise(guided, monkeypatch, [1.08, 1.8, 0.7])
     assert asked[0] == asked[1]
     assert looked == ["hanging-1080", "hanging-1800", "hanging-700"]
@@ -243,10 +244,10 @@ def test_a_wrong_height_replaces_nothing(
     begun, session, _ = guided
     session.record_resting("hanging-1800", [])
     session.record_resting("hanging-700", [])
-    monkeypatch.setattr(procedure, "wrong_height", _wrong_at_1080)
+    monkeypatch.setattr(raised_ball, "_wrong_height", _wrong_at_1080)
     unattended = replace(begun, guide=replace(begun.guide, attended=False))
     with pytest.raises(CalibrationError, match=r"seen near 1\.8 m"):
-        unattended.raise_ball(1.08, "hanging")
+        see_height(unattended, 1.08, "hanging")
     assert Session.load(session.folder).raised == ["hanging-1800", "hanging-700"]
 
 
@@ -265,7 +266,7 @@ def test_heights_are_kept_until_others_are_seen(
     def not_seen(*_: object) -> None:
         raise ends
 
-    monkeypatch.setattr(procedure, "rest_ball", not_seen)
+    monkeypatch.setattr(attempt, "rest_ball", not_seen)
     with pytest.raises(type(ends)):
         _raise(guided, monkeypatch, [1.7], again=True)
     assert Session.load(session.folder).raised == ["hanging-1800", "hanging-700"]
@@ -281,7 +282,7 @@ def test_a_kind_that_is_given_is_not_asked_for(
     begun, session, _ = guided
     heights_m = [1.8, 0.7]
     monkeypatch.setattr(click, "prompt", lambda *_, **__: heights_m.pop(0))
-    begun.raised(again=True, kind="hanging")
+    see_all_heights(begun, again=True, kind="hanging")
     assert session.raised == ["hanging-1800", "hanging-700"]
     assert seconds
 
@@ -301,7 +302,7 @@ def test_recorded_heights_that_cannot_be_used_are_named(
     for name in [*names, "standing-1200"]:
         (tmp_path / "recordings" / name).mkdir(parents=True)
     with pytest.raises(CalibrationError, match=words):
-        replace(begun, recordings=tmp_path / "recordings").raised()
+        see_all_heights(replace(begun, recordings=tmp_path / "recordings"))
     assert looked == []
 
 
@@ -316,7 +317,7 @@ def test_all_recorded_heights_are_looked_at(
     for name in ("hanging-700", "hanging-1800", "stand-1500", "standing-1200"):
         (tmp_path / "recordings" / name).mkdir(parents=True)
     (tmp_path / "recordings" / "stand-plan.pdf").touch()
-    _replayed(begun, tmp_path / "recordings").raised()
+    see_all_heights(_replayed(begun, tmp_path / "recordings"))
     assert looked == ["hanging-1800", "hanging-700", "stand-1500"]
     assert session.raised == looked
 
@@ -330,10 +331,10 @@ def test_recorded_heights_replace_those_before(
     for name in ("stand-900", "stand-1700"):
         (tmp_path / "recordings" / name).mkdir(parents=True)
     replayed = _replayed(begun, tmp_path / "recordings")
-    replayed.raised(again=True)
+    see_all_heights(replayed, again=True)
     assert session.raised == ["stand-1700", "stand-900"]
     with pytest.raises(CalibrationError, match=r"no recording of the ball on a stand or hanging"):
-        _replayed(begun, tmp_path).raised(again=True)
+        see_all_heights(_replayed(begun, tmp_path), again=True)
 
 
 def test_no_stand_is_asked_about_once(
@@ -344,7 +345,7 @@ def test_no_stand_is_asked_about_once(
     answers = [0.0, 1.7]
     _answers(monkeypatch, [False])
     monkeypatch.setattr(click, "prompt", lambda *_, **__: answers.pop(0))
-    begun.raised()
+    see_all_heights(begun)
     assert answers == [1.7]
     assert looked == []
 

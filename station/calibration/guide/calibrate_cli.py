@@ -238,10 +238,12 @@ def stand(procedure: Procedure, height_m: float | None, hanging: bool) -> None:
       station calibrate stand --height 1.8 --hanging
       station calibrate stand --height 0.7 --hanging
     """
+    from station.calibration.guide.raised_ball import see_all_heights, see_height
+
     if height_m is not None:
-        procedure.raise_ball(height_m, HANGING if hanging else STAND)
+        see_height(procedure, height_m, HANGING if hanging else STAND)
     elif procedure.guide.attended or procedure.recordings is not None:
-        procedure.raised(again=True, kind=HANGING if hanging else None)
+        see_all_heights(procedure, again=True, kind=HANGING if hanging else None)
     else:
         raise click.UsageError("nobody is asked with --yes: give --height METRES")
 

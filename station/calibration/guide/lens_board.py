@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,44 +14,42 @@ from station.calibration.detect.board import (
     find_board,
     judge_lens,
 )
+from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.seen import Lens
 from station.calibration.guide.session import Session
 from station.core.errors import CalibrationError
 from station.core.rig import Rig
 
-if TYPE_CHECKING:
-    from station.calibration.guide.procedure import Procedure
-
 _IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif")
 
 
-def judge_lenses(procedure: Procedure, images: Path, printed: Board) -> None:
+def judge_lenses(attempt: Attempt, images: Path, printed: Board) -> None:
     """Say what images DIR/<camera>/<moment>.png tell of each lens, and keep better ones.
 
     Raises:
         CalibrationError: no image has the board, or one cannot be read.
     """
-    session = procedure.session()
+    session = attempt.session()
     views: dict[str, list[BoardView]] = {}
     for name in session.cameras:
         views[name] = _board_views(images / name, printed, session, name)
-        procedure.guide.say(f"camera {name}: the board is seen in {len(views[name])} images")
+        attempt.guide.say(f"camera {name}: the board is seen in {len(views[name])} images")
     if not any(views.values()):
         raise CalibrationError(
             f"{images} has no image of the board: DIR/<camera>/<moment>.png, cameras "
             f"{', '.join(session.cameras)}"
         )
-    if procedure.store.in_use.exists():
-        ties = check_agreement(Rig.load(procedure.store.in_use), views, printed)
+    if attempt.store.in_use.exists():
+        ties = check_agreement(Rig.load(attempt.store.in_use), views, printed)
         for (one, other), off_m in ties.pairs.items():
-            procedure.guide.say(
+            attempt.guide.say(
                 f"{one} and {other} see the board's corners {1e3 * off_m:.1f} mm apart "
                 "through the calibration in use"
             )
     found: dict[str, Lens | None] = {}
     for name, seen in views.items():
         report = judge_lens(session.cameras[name], seen, printed)
-        procedure.guide.say(report.words())
+        attempt.guide.say(report.words())
         lens = report.lens
         found[name] = None if lens is None else Lens(lens.K.tolist(), lens.distortion.tolist())
     session.record_lenses(found)

@@ -2,57 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
 
-from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.step_names import (
     AROUND,
     BALL,
     EMPTY,
     FRONT,
-    HANGING,
-    HEIGHTS_M,
     MARK,
     PLACES,
-    RAISED,
-    RAISED_M,
-    STAND,
     WALL,
     numbered_step,
-    raised_height_m,
-    raised_step,
 )
-from station.calibration.guide.feed import Feed, live_feed, replayed_feed
-from station.calibration.guide.heights import (
-    HOOK,
-    measured_height,
-    out_of_sight,
-    recorded_heights,
-    wrong_height,
-)
-from station.calibration.guide.operator import Guide
-from station.calibration.guide.seen import listed
-from station.calibration.guide.session import SESSION, Session
+from station.calibration.guide.attempt import Attempt, utc_now
+from station.calibration.guide.raised_ball import see_all_heights
+from station.calibration.guide.session import Session
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
     coverage_so_far,
     look_at_empty_booth,
     look_at_wall,
-    rest_ball,
     wave_ball,
 )
-from station.calibration.guide.store import CalibrationStore
-from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
-from station.messaging.messages import Request
-from station.messaging.transport import ask_again
 
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
-_SENSORS_S = 20.0
 _MAX_BOARDS, _MAX_PLACES = 20, 20
 _SURE_OF_RADIUS = 60
 """Sightings from which on a ball of another radius is told."""
@@ -63,43 +37,8 @@ _AROUND = ("to the left of the mark", "to the right of the mark", "behind the ma
 
 
 @dataclass(frozen=True, slots=True)
-class Procedure:
+class Procedure(Attempt):
     """A booth's calibration: each step by itself, or all that are not done yet."""
-
-    config: BoothConfig
-    store: CalibrationStore
-    recordings: Path | None
-    """DIR/<step>/<camera> in place of the live cameras."""
-    guide: Guide
-
-    def unfinished_session(self) -> Session | None:
-        """The calibration that is being done, if one is."""
-        folder = self.store.unfinished
-        return Session.load(folder) if (folder / SESSION).exists() else None
-
-    def session(self) -> Session:
-        """The calibration that is being done.
-
-        Raises:
-            CalibrationError: there is none.
-        """
-        session = self.unfinished_session()
-        if session is None:
-            last = self.store.newest()
-            raise CalibrationError(
-                "no calibration has been started; station calibrate goes through all steps"
-                if last is None
-                else f"the last calibration, {last}, is finished; station calibrate begins "
-                "another, and a single step (ball, around, stand, depth) adds to it"
-            )
-        return session
-
-    def _session_to_add_to(self) -> Session | None:
-        """The calibration that is being done, or else the one in use: a further step adds to it."""
-        session = self.unfinished_session()
-        if session is None and (used := self.store.resumable()):
-            return Session.load(self.store.folder / used)
-        return session
 
     def run(self) -> None:
         """All steps that are not done yet."""
@@ -129,7 +68,7 @@ class Procedure:
             self.rest(FRONT)
         if session is None or session.around_count < len(_AROUND):
             self.around(asked=True)
-        self.raised()
+        see_all_heights(self)
         if session is None or session.wall_count < _BOARDS:
             self.walls(asked=True)
         self.solve()
@@ -165,22 +104,22 @@ class Procedure:
 
     def empty(self) -> None:
         """The empty booth and its floor."""
-        self._check_station()
+        self.check_station()
         self.guide.step("Empty booth", "Leave the booth empty; nobody in sight of the cameras.")
-        with self._feed(EMPTY) as (feed, session):
+        with self.feed(EMPTY) as (feed, session):
             look_at_empty_booth(feed, session, self.guide)
 
     def ball(self, *, again: bool = False) -> None:
         """The ball, waved; ``again``: instead of what was seen of it before."""
-        self._check_station()
+        self.check_station()
         wanted = self.config.calibrate
         self.guide.step(
             "Ball",
             f"Wave the ball ({2e2 * wanted.ball_radius_m:g} cm wide) slowly through the whole "
             f"booth for {wanted.waving_s:g} s: low and high, left and right, around the mark.",
         )
-        with self._feed(BALL) as (feed, session):
-            self._remark_on_ghosts(session)
+        with self.feed(BALL) as (feed, session):
+            self.remark_on_ghosts(session)
             # A recording begins anew: what it shows twice was seen once.
             if session.balls and (again or self.recordings is not None):
                 session.forget_balls()
@@ -198,7 +137,7 @@ class Procedure:
 
     def around(self, asked: bool) -> None:
         """The ball on the floor beside and behind the mark; more places where they are wanted."""
-        session = self._session_to_add_to()
+        session = self.session_to_add_to()
         before = session.around_count if session and self.recordings is None else 0
         for place in range(before, before + _MAX_PLACES):
             step = numbered_step(AROUND, place)
@@ -213,113 +152,14 @@ class Procedure:
             instruction = "0.6 m away, where a lower camera sees it." if place == before else ""
             self._lay(step, f"Ball on the floor {where}", instruction)
 
-    def raised(self, *, again: bool = False, kind: str | None = None) -> None:
-        """The ball at two measured heights that the operator gives; at all that are recorded.
-
-        ``again``: instead of those at which it was seen before; ``kind``: STAND or HANGING, or None
-        to ask.
-        """
-        if self.recordings is not None:
-            self._raised_in(self.recordings, again)
-            return
-        session = self._session_to_add_to()
-        seen = {
-            kind: list(session.raised_as(kind).values()) if session and not again else []
-            for kind in RAISED
-        }
-        complete = any(len(own) >= len(HEIGHTS_M[kind]) for kind, own in seen.items())
-        if complete or not self.guide.attended:
-            return
-        self._check_station()
-        self.guide.title("Ball at two heights")
-        begun = next((kind for kind, own in seen.items() if len(own) == 1), None)
-        kind = begun or kind
-        if kind is None:
-            kind = HANGING if self.guide.answers_yes(HOOK, usual=False) else STAND
-        others_m = seen[kind] if begun else []
-        best_m = list(HEIGHTS_M[kind])
-        if begun:
-            best_m = [max(best_m, key=lambda height_m: abs(height_m - others_m[0]))]
-        while best_m:
-            height_m = measured_height(self.guide, kind, best_m[0], others_m)
-            if height_m is None:
-                return
-            self.guide.count_down()
-            if words := self._see_raised(height_m, kind, again=again and not others_m):
-                self.guide.say(words)
-                continue
-            others_m.append(height_m)
-            best_m.pop(0)
-
-    def _raised_in(self, recordings: Path, again: bool) -> None:
-        recorded = recorded_heights(recordings)
-        if again and not recorded:
-            raise CalibrationError(
-                f"{recordings} holds no recording of the ball on a stand or hanging (a folder such "
-                f"as {STAND}-1700 or {HANGING}-1800)"
-            )
-        for kind, height_m in recorded:
-            self.raise_ball(height_m, kind, again=again)
-            again = False
-
-    def raise_ball(self, height_m: float, kind: str, *, again: bool = False) -> None:
-        """The ball on a stand or hanging (STAND, HANGING), its underside at a measured height above
-        the floor.
-
-        ``again``: instead of all heights before.
-
-        Raises:
-            CalibrationError: it is not seen there.
-        """
-        if not RAISED_M[0] <= height_m <= RAISED_M[1]:
-            raise CalibrationError(out_of_sight(height_m))
-        self._check_station()
-        if kind == HANGING:
-            where = f"hanging above the mark, its underside {height_m:g} m above the floor"
-            instruction = "Wait until it hangs still, and step back."
-        else:
-            where = f"on a stand on the mark, its underside {height_m:g} m above the floor"
-            instruction = "Put it up and step back."
-        self.guide.step(f"Ball {where}", instruction, lays=True)
-        if words := self._see_raised(height_m, kind, again=again):
-            raise CalibrationError(words)
-        if kind == HANGING and self.recordings is None:
-            self._ask_for_the_other()
-
-    def _see_raised(self, height_m: float, kind: str, *, again: bool) -> str | None:
-        """Keep the ball at a height; words on one that is wrong, which is not kept."""
-        step = raised_step(kind, height_m)
-        session, balls = self._see_at_rest(step)
-        if words := wrong_height(session, step, balls, self.config.reference):
-            return words
-        before = {place: raised_height_m(place) or 0.0 for place in session.raised}
-        session.record_resting(step, balls)
-        if again and (others := [place for place in session.raised if place != step]):
-            session.forget_raised(others)
-        if gone_m := sorted(before[place] for place in before.keys() - set(session.raised)):
-            self.guide.say(f"this replaces the ball that was seen at {listed(gone_m)} m")
-        return None
-
-    def _ask_for_the_other(self) -> None:
-        """Name the height that is missing, if the ball hung at one only."""
-        session = self._session_to_add_to()
-        own_m = list(session.raised_as(HANGING).values()) if session else []
-        if len(own_m) == 1:
-            upper_m, lower_m = HEIGHTS_M[HANGING]
-            other_m = lower_m if own_m[0] > 0.5 * (upper_m + lower_m) else upper_m
-            self.guide.say(
-                f"now about {other_m:g} m above the floor, from the same hook, and still: two "
-                "heights show what is vertical"
-            )
-
     def walls(self, asked: bool) -> None:
         """The flat board at some places: as many as are asked for, as the operator likes, or as are
         recorded."""
         # Live, a further board is added to those that were seen; recordings have their own places.
-        session = self._session_to_add_to()
+        session = self.session_to_add_to()
         if session is None or not session.done(EMPTY):
             raise CalibrationError(EMPTY_FIRST)
-        self._check_station()
+        self.check_station()
         live = self.recordings is None
         before = session.wall_count if live else 0
         for place in range(before, _BOARDS if live and asked else before + _MAX_BOARDS):
@@ -331,7 +171,7 @@ class Procedure:
                     self.guide.title("Flat board")
             elif not self._board_stands(place, first=place == before, asked=asked):
                 return
-            with self._feed(numbered_step(WALL, place)) as (feed, session):
+            with self.feed(numbered_step(WALL, place)) as (feed, session):
                 look_at_wall(feed, session, self.guide, place)
 
     def _board_stands(self, place: int, *, first: bool, asked: bool) -> bool:
@@ -371,7 +211,7 @@ class Procedure:
             radius_m=session.radius_m,
             reference=self.config.reference,
             front_cameras=self.config.front_cameras,
-            created=_now(),
+            created=utc_now(),
             progress=self.guide.progress,
             limits=Limits(
                 self.config.calibrate.height_limit_m, self.config.calibrate.girth_limit_m
@@ -384,64 +224,7 @@ class Procedure:
         self.guide.done(f"calibration {entry.name} is in use ({entry.folder})")
 
     def _lay(self, step: str, title: str, instruction: str) -> None:
-        self._check_station()
+        self.check_station()
         self.guide.step(title, instruction, lays=True)
-        session, balls = self._see_at_rest(step)
+        session, balls = self.see_at_rest(step)
         session.record_resting(step, balls)
-
-    def _see_at_rest(self, step: str) -> tuple[Session, list[BallDetection]]:
-        with self._feed(step) as (feed, session):
-            self._remark_on_ghosts(session)
-            return session, rest_ball(feed, session, self.guide, step)
-
-    def _check_station(self) -> None:
-        """Refuse before anybody has put something up, rather than after a countdown."""
-        if self.guide.attended:
-            runtime = self.config.runtime
-            ask_again(runtime.folder, "control", Request("status"), runtime.command_timeout_s)
-
-    def _remark_on_ghosts(self, session: Session) -> None:
-        if not session.done(EMPTY):
-            self.guide.say(
-                "the empty booth has not been recorded: round objects in it may be taken for the "
-                "ball (run station calibrate floor)"
-            )
-
-    @contextmanager
-    def _feed(self, step: str) -> Iterator[tuple[Feed, Session]]:
-        """Frames for a step and the calibration that is being done; begun if there is none."""
-        if self.recordings is None:
-            source = live_feed(self.config)
-        elif (self.recordings / step).is_dir():
-            source = replayed_feed(self.config, self.recordings / step)
-        else:
-            inside = sorted(self.recordings.iterdir())
-            known = ", ".join(path.name for path in inside) or "nothing"
-            deeper = [path for path in inside if (path / step).is_dir()]
-            hint = f" ({deeper[0]} does)" if deeper else ""
-            raise CalibrationError(
-                f"{self.recordings} holds no recording of the step {step}; it holds {known}{hint}"
-            )
-        with source as feed:
-            cameras = feed.cameras(_SENSORS_S)
-            session = self.unfinished_session() if step == EMPTY else self._session_to_add_to()
-            if session is None:
-                session = Session.begin(
-                    self.store.unfinished, _now(), self.config.calibrate.ball_radius_m, cameras
-                )
-                if self.store.in_use.exists():
-                    self.guide.say("a new calibration; until it is solved, the other is in use")
-            else:
-                session.check_cameras(cameras)
-                session.check_radius(self.config.calibrate.ball_radius_m)
-            if session.folder != self.store.unfinished:
-                session = self.store.reopen(session.folder.name)
-                self.guide.say(
-                    f"added to what calibration {session.adds_to} was solved from; if a camera was "
-                    "moved since, begin anew: station calibrate --new"
-                )
-            yield feed, session
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

@@ -1,4 +1,4 @@
-"""What a calibration has seen so far, step by step, and what it amounts to."""
+"""Observations of a calibration so far, step by step, and what they amount to."""
 
 from __future__ import annotations
 

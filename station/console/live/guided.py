@@ -13,6 +13,7 @@ from typing import Any
 from station.calibration.detect.step_names import FRONT, MARK
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
+from station.calibration.guide.raised_ball import see_all_heights
 from station.calibration.guide.store import CalibrationStore
 from station.core.config_file import load_config
 from station.core.errors import BoothError
@@ -105,7 +106,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "around":
                 procedure.around(asked=False)
             case "stand":
-                procedure.raised(again=True)
+                see_all_heights(procedure, again=True)
             case "depth":
                 procedure.walls(asked=False)
             case "solve":

@@ -1,0 +1,128 @@
+"""An attempt at a calibration: its frames, its operator, and where what is seen goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from station.calibration.detect.detections import BallDetection
+from station.calibration.detect.step_names import EMPTY
+from station.calibration.guide.feed import Feed, live_feed, replayed_feed
+from station.calibration.guide.operator import Guide
+from station.calibration.guide.session import SESSION, Session
+from station.calibration.guide.steps import rest_ball
+from station.calibration.guide.store import CalibrationStore
+from station.core.config import BoothConfig
+from station.core.errors import CalibrationError
+from station.core.rig import CameraCalibration
+from station.messaging.messages import Request
+from station.messaging.transport import ask_again
+
+_SENSORS_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A booth that is being calibrated, live or from recordings."""
+
+    config: BoothConfig
+    store: CalibrationStore
+    recordings: Path | None
+    """DIR/<step>/<camera> in place of the live cameras."""
+    guide: Guide
+
+    def unfinished_session(self) -> Session | None:
+        """The calibration that is being done, if one is."""
+        folder = self.store.unfinished
+        return Session.load(folder) if (folder / SESSION).exists() else None
+
+    def session(self) -> Session:
+        """The calibration that is being done.
+
+        Raises:
+            CalibrationError: there is none.
+        """
+        session = self.unfinished_session()
+        if session is None:
+            last = self.store.newest()
+            raise CalibrationError(
+                "no calibration has been started; station calibrate goes through all steps"
+                if last is None
+                else f"the last calibration, {last}, is finished; station calibrate begins "
+                "another, and a single step (ball, around, stand, depth) adds to it"
+            )
+        return session
+
+    def session_to_add_to(self) -> Session | None:
+        """The calibration that is being done, or else the one in use: a further step adds to it."""
+        session = self.unfinished_session()
+        if session is None and (used := self.store.resumable()):
+            return Session.load(self.store.folder / used)
+        return session
+
+    def see_at_rest(self, step: str) -> tuple[Session, list[BallDetection]]:
+        """The ball where it was put in a step, and the calibration that it is seen in."""
+        with self.feed(step) as (feed, session):
+            self.remark_on_ghosts(session)
+            return session, rest_ball(feed, session, self.guide, step)
+
+    def check_station(self) -> None:
+        """Refuse before anybody has put something up, rather than after a countdown."""
+        if self.guide.attended:
+            runtime = self.config.runtime
+            ask_again(runtime.folder, "control", Request("status"), runtime.command_timeout_s)
+
+    def remark_on_ghosts(self, session: Session) -> None:
+        """Say so where nothing tells the ball from what always stands in the booth."""
+        if not session.done(EMPTY):
+            self.guide.say(
+                "the empty booth has not been recorded: round objects in it may be taken for the "
+                "ball (run station calibrate floor)"
+            )
+
+    @contextmanager
+    def feed(self, step: str) -> Iterator[tuple[Feed, Session]]:
+        """Frames for a step and the calibration that is being done; begun if there is none."""
+        with self._source(step) as feed:
+            yield feed, self._joined(step, feed.cameras(_SENSORS_S))
+
+    def _source(self, step: str) -> AbstractContextManager[Feed]:
+        if self.recordings is None:
+            return live_feed(self.config)
+        if (self.recordings / step).is_dir():
+            return replayed_feed(self.config, self.recordings / step)
+        inside = sorted(self.recordings.iterdir())
+        known = ", ".join(path.name for path in inside) or "nothing"
+        deeper = [path for path in inside if (path / step).is_dir()]
+        hint = f" ({deeper[0]} does)" if deeper else ""
+        raise CalibrationError(
+            f"{self.recordings} holds no recording of the step {step}; it holds {known}{hint}"
+        )
+
+    def _joined(self, step: str, cameras: Mapping[str, CameraCalibration]) -> Session:
+        """The calibration that a step of these cameras goes into."""
+        session = self.unfinished_session() if step == EMPTY else self.session_to_add_to()
+        if session is None:
+            session = Session.begin(
+                self.store.unfinished, utc_now(), self.config.calibrate.ball_radius_m, cameras
+            )
+            if self.store.in_use.exists():
+                self.guide.say("a new calibration; until it is solved, the other is in use")
+        else:
+            session.check_cameras(cameras)
+            session.check_radius(self.config.calibrate.ball_radius_m)
+        if session.folder != self.store.unfinished:
+            session = self.store.reopen(session.folder.name)
+            self.guide.say(
+                f"added to what calibration {session.adds_to} was solved from; if a camera was "
+                "moved since, begin anew: station calibrate --new"
+            )
+        return session
+
+
+def utc_now() -> str:
+    """The date of what is made now, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
