@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.calibration.guide.feed import Feed, RecordedClock, gather_frames, replayed_feed
+from station.calibration.guide.feed import Feed, gather_frames, replayed_feed
+from station.calibration.guide.recorded_clock import RecordedClock
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError, FormatError
 from station.messaging.messages import FrameHeader
