@@ -7,7 +7,8 @@ import synthetic_calibration as synthetic
 from numpy.typing import NDArray
 
 from station.calibration.detect.detections import Observations
-from station.calibration.solve.solution import Solution, solve
+from station.calibration.solve.solution import Solution
+from station.calibration.solve.solving import solve
 from station.calibration.solve.world import WorldPoses, relative_poses
 from station.core.geometry import invert, twist_between
 from station.core.rig import Rig

@@ -14,8 +14,9 @@ from scan_distortion import distortion
 
 from station.calibration.detect.detections import FLOOR, BallDetection, Observations
 from station.calibration.detect.step_names import BALL
-from station.calibration.solve import solution as solution_module
-from station.calibration.solve.solution import Solution, height_words
+from station.calibration.solve import solving
+from station.calibration.solve.first_problem import height_words
+from station.calibration.solve.solution import Solution
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -243,7 +244,7 @@ def test_two_cameras_that_agree_on_a_head_do_no_harm(
 def test_what_does_not_settle_is_refused(
     procedure: VirtualProcedure, seen: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(solution_module, "_FINE_ITERATIONS", 1)
+    monkeypatch.setattr(solving, "_FINE_ITERATIONS", 1)
     with pytest.raises(CalibrationError, match="the cameras do not agree on where the ball was"):
         solved(procedure.booth.rig, seen)
 

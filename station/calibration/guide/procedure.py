@@ -200,7 +200,7 @@ class Procedure(Attempt):
     def solve(self) -> None:
         """The solution from what was seen, put into use."""
         from station.calibration.solve.refusals import Limits
-        from station.calibration.solve.solution import solve
+        from station.calibration.solve.solving import solve
 
         session = self.session()
         session.check_radius(self.config.calibrate.ball_radius_m)

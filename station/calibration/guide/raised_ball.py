@@ -206,11 +206,11 @@ def _wrong_height(
     """
     if not seen.balls:
         return None
-    from station.calibration.solve import solution
+    from station.calibration.solve.first_problem import height_words
 
     raised = set(seen.raised)
     laid = {place: there for place, there in seen.around.items() if place not in raised}
-    return solution.height_words(
+    return height_words(
         replace(seen.observations(), around={**laid, step: balls}),
         seen.lensed_cameras(),
         radius_m=seen.radius_m,
