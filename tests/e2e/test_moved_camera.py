@@ -99,6 +99,7 @@ def test_a_scan_is_accepted_when_none_has(
     checked = station.command("check", "--json")
     assert checked.returncode == 4, checked.stdout
     assert '"moved": false' in checked.stdout
+    assert '"changed": true' in checked.stdout
 
 
 def test_a_calibration_without_its_empty_booth_cannot_be_checked(booth: Path) -> None:

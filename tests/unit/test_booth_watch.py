@@ -102,6 +102,21 @@ def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
     assert tasks.state()["lines"] == ["1.7"]
 
 
+def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: Path) -> None:
+    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    moves = [
+        {"camera": "front-lower", "moved": False, "lost": False, "changed": True},
+        {"camera": "front-upper", "moved": False, "lost": False, "changed": False},
+    ]
+    checked = f"import sys; print({json.dumps(json.dumps(moves))}); sys.exit(4)"
+    tasks._begin("check", "", [sys.executable, "-c", checked])
+    _until(lambda: not tasks.state()["running"])
+    last = tasks.last_check()
+    assert last is not None
+    assert (last["moved"], last["changed"]) == ([], ["front-lower"])
+    assert tasks.state()["error"] == ""
+
+
 def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
     tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
     command = [sys.executable, "-c", _ASKS]

@@ -144,6 +144,7 @@ def _document(move: CameraMove) -> dict[str, object]:
         "camera": move.camera,
         "moved": move.moved,
         "lost": move.lost,
+        "changed": move.changed,
         "rotation_rad": move.xi[:3].tolist(),
         "translation_m": move.xi[3:].tolist(),
         "sigma": np.sqrt(np.diag(move.stated)).tolist(),

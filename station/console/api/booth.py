@@ -136,12 +136,11 @@ def _session(console: Console, caller: Caller | None) -> Session:
 @router.get("/booth", responses=responses(), tags=["booth"])
 def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
     """Cameras with their remedies, framesets, spool, disk, calibration, hand-overs."""
-    check = console.tasks.last_check()
     ledger = Ledger(console.config.spool.folder)
     return BoothState(
         **console.watch.booth(),
         calibration=_calibration_in_use(console),
-        last_check=Check(time=check["time"], moved=check["moved"]) if check else None,
+        last_check=_last_check(console),
         waiting_deliveries=[Delivery(**entry.document()) for entry in ledger.waiting()],
     )
 
@@ -255,6 +254,14 @@ def _calibration_in_use(console: Console) -> str:
         return Rig.load(store.in_use).created
     except (BoothError, OSError):
         return ""
+
+
+def _last_check(console: Console) -> Check | None:
+    check = console.tasks.last_check()
+    if check is None:
+        return None
+    # Versions that did not keep what had changed wrote files that may still be there.
+    return Check(time=check["time"], moved=check["moved"], changed=check.get("changed", []))
 
 
 def _store(console: Console) -> CalibrationStore:

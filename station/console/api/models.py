@@ -50,6 +50,9 @@ class Check(BaseModel):
 
     time: str
     moved: list[str]
+    changed: list[str] = Field(
+        description="cameras whose view looks too different to tell small moves"
+    )
 
 
 class Delivery(BaseModel):

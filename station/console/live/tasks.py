@@ -20,7 +20,8 @@ from station.core.files import write_json
 from station.core.service import die_with_parent
 
 _LINES_KEPT = 60
-_EXIT_MOVED = 3
+_EXITS_OF_A_CHECK = (0, 3, 4)
+"""No camera has moved; one has; the booth looks too different to tell."""
 _ANSWERS = {"go": ("go",), "yes or no": ("yes", "no"), "height": ("no",)}
 """Kind of question -> the words that answer it; a height is answered by a number, too."""
 CHECK_FILE = "last-check.json"
@@ -145,7 +146,7 @@ class Tasks:
         code = process.wait()
         with self._lock:
             self._process = None
-            if words and code not in (0, _EXIT_MOVED):
+            if words and code not in _EXITS_OF_A_CHECK:
                 self._state["error"] = words[-1].removeprefix("error: ")
             self._state |= {"running": False, "waits_for": "", "countdown_s": None}
         self._tell()
@@ -177,7 +178,9 @@ class Tasks:
     def _keep_check(self, moves: list[Any]) -> None:
         now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
         bad = [m["camera"] for m in moves if m["moved"] or m["lost"]]
-        write_json(self._folder / CHECK_FILE, {"time": now, "moved": bad, "cameras": moves})
+        changed = [m["camera"] for m in moves if m["changed"]]
+        found = {"time": now, "moved": bad, "changed": changed, "cameras": moves}
+        write_json(self._folder / CHECK_FILE, found)
 
     def _tell(self) -> None:
         self._events.append("calibration", self.state())

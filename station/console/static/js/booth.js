@@ -44,6 +44,13 @@ export async function booth(main) {
     }
   }
 
+  function checked(last) {
+    const parts = [];
+    if (last.moved.length) parts.push(t('booth.checkMoved', { names: last.moved.join(', ') }));
+    if (last.changed.length) parts.push(t('booth.checkChanged', { names: last.changed.join(', ') }));
+    return parts.join(' ') || t('booth.checkGood');
+  }
+
   function show() {
     for (const camera of state.cameras) cameras.state(camera);
     power.textContent = t(state.streaming ? 'booth.stop' : 'booth.start');
@@ -64,8 +71,7 @@ export async function booth(main) {
     banner.className = `banner ${state.running ? 'warn' : 'bad'}`;
     banner.textContent = fault;
     const last = state.last_check;
-    checkText.textContent = last === null ? t('booth.never')
-      : `${time(last.time)} – ${last.moved.length ? t('booth.checkMoved', { names: last.moved.join(', ') }) : t('booth.checkGood')}`;
+    checkText.textContent = last === null ? t('booth.never') : `${time(last.time)} – ${checked(last)}`;
     deliveries.hidden = state.waiting_deliveries.length === 0;
     deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
       ...state.waiting_deliveries.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${said(one.error)}` : ''}`)));
