@@ -29,3 +29,15 @@ def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> N
         page.click("tr[data-name=waist_girth]")
         expect(page.locator("#line-name")).to_contain_text("Waist girth")
     assert errors == []
+
+
+def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "calibration")
+        page.click("button[data-step=solve]")
+        expect(page.locator("#task-error")).to_have_text(
+            "no calibration has been started; “All remaining steps” goes through all steps",
+            timeout=LONG_MS,
+        )

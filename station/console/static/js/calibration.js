@@ -10,7 +10,7 @@ import { settings } from './settings.js';
 const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
 const LOWEST_M = 0.3;
 const HIGHEST_M = 2.2;
-const COMMAND = /station calibrate(?: (--new|[a-z]+))?(?: --[a-z]+)*/g;
+const COMMAND = new RegExp(`station calibrate(?: (--new|(?:${STEPS.join('|')})\\b))?(?: --[a-z]+)*`, 'g');
 
 // What the station says; the commands that it names are buttons here.
 function said(text) {
