@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import open3d as o3d
 import pytest
+from click.testing import CliRunner
 
 from station.core.errors import InputError
-from workers.reconstruct.fit_cli import _publish
+from station.simulation.scene import load_mesh
+from workers.reconstruct.fit_cli import _publish, fit
+
+BODY = Path(__file__).parents[2] / "station/simulation/bodies/ann.npz"
 
 
 def test_a_result_whose_name_was_taken_during_the_fit_is_kept(tmp_path: Path) -> None:
@@ -20,3 +25,20 @@ def test_a_result_whose_name_was_taken_during_the_fit_is_kept(tmp_path: Path) ->
         _publish(made, other)
     assert (tmp_path / "result-x7/mesh.ply").read_bytes() == b"a body"
     assert not list(other.iterdir())
+
+
+def test_a_cloud_that_is_given_as_a_bundle_is_told_its_option(tmp_path: Path) -> None:
+    done = CliRunner().invoke(fit, [str(tmp_path / "body.ply"), "--out", str(tmp_path / "r")])
+    assert done.exit_code == 2
+    assert "body.ply is no scan bundle" in done.output
+    assert "--cloud" in done.output
+
+
+def test_half_a_body_is_told_to_be_scanned_whole(tmp_path: Path) -> None:
+    points = load_mesh(BODY).vertices
+    upper = o3d.utility.Vector3dVector(points[points[:, 2] > 0.8])
+    o3d.io.write_point_cloud(str(tmp_path / "upper.ply"), o3d.geometry.PointCloud(upper))
+    words = ["--cloud", str(tmp_path / "upper.ply"), "--out", str(tmp_path / "r")]
+    done = CliRunner().invoke(fit, words)
+    assert isinstance(done.exception, InputError)
+    assert "scan the whole person" in str(done.exception)

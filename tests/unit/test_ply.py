@@ -43,6 +43,19 @@ def test_other_values_of_a_vertex_are_passed_over(tmp_path: Path) -> None:
     assert faces.tolist() == [[0, 1, 2]]
 
 
+@pytest.mark.parametrize("faces", [0, 1])
+def test_of_a_torn_binary_one_is_told_how_much_is_missing(tmp_path: Path, faces: int) -> None:
+    path = tmp_path / "mesh.ply"
+    mesh = o3d.geometry.TriangleMesh.create_sphere(0.3)
+    o3d.io.write_triangle_mesh(str(path), mesh)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: -5 if faces else len(whole) // 4])
+    with pytest.raises(
+        ValueError, match=r"it is torn: \d+ bytes of values were promised, \d+ came"
+    ):
+        (read_triangles if faces else read_points)(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -65,7 +65,7 @@ def read_triangles(path: Path) -> tuple[Array, NDArray[np.int32]]:
     if order:
         size, corner = (order + kind for kind in faces.lists[0])
         layout = np.dtype([("size", size), ("corners", corner, (3,))])
-        found = np.frombuffer(rest, layout, faces.count)
+        found = _records(rest, layout, faces.count)
         sizes, corners = found["size"], found["corners"].astype(np.float64)
     else:
         table = _table(rest.split(), faces.count, 4)
@@ -111,7 +111,7 @@ def _vertices(order: str, vertex: _Element, body: bytes) -> tuple[Array, bytes]:
     width = len(vertex.scalars)
     if order:
         layout = np.dtype([(name, order + kind) for name, kind in vertex.scalars])
-        rows = np.frombuffer(body, layout, vertex.count)
+        rows = _records(body, layout, vertex.count)
         table = np.empty((len(rows), width))
         for column, (name, _) in enumerate(vertex.scalars):
             table[:, column] = rows[name]
@@ -119,6 +119,13 @@ def _vertices(order: str, vertex: _Element, body: bytes) -> tuple[Array, bytes]:
     words = body.split(maxsplit=vertex.count * width)
     rest = words.pop() if len(words) > vertex.count * width else b""
     return _table(words, vertex.count, width), rest
+
+
+def _records(body: bytes, layout: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    needed = count * layout.itemsize
+    if len(body) < needed:
+        raise ValueError(f"it is torn: {needed} bytes of values were promised, {len(body)} came")
+    return np.frombuffer(body, layout, count)
 
 
 def _table(words: Sequence[bytes], count: int, width: int) -> Array:

@@ -61,6 +61,8 @@ def fit(
     """
     if (bundle is None) == (cloud is None):
         raise click.UsageError("give either a bundle or --cloud FILE")
+    if bundle is not None and bundle.suffix.lower() in (".ply", ".pcd"):
+        raise click.UsageError(f"{bundle} is no scan bundle; for a point cloud: --cloud {bundle}")
     _check_folders(out_folder, debug_folder)
     from workers.cloud.cloud_file import read_cloud
     from workers.reconstruct import job

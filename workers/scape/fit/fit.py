@@ -345,5 +345,6 @@ def _check(cloud: PointCloud) -> None:
     height_m = float(np.ptp(cloud.points[:, 2]))
     if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
         raise InputError(
-            f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected"
+            f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected: "
+            "scan the whole person, from the soles to the top of the head"
         )
