@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from station.booth.frameset import Frameset
@@ -59,3 +59,20 @@ class Collection:
             f"only {len(self.sets)} of {self.wanted} framesets arrived within {within_s:g} s; see "
             "station status, then scan again"
         )
+
+
+def silence_in_words(why: Mapping[str, str]) -> str:
+    """Cameras that send no frames, those of one reason together.
+
+    Args:
+        why: camera -> the reason in brackets, or nothing.
+    """
+    together: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        together.setdefault(reason, []).append(name)
+    return "; ".join(
+        f"camera {names[0]} sends no frames{reason}"
+        if len(names) == 1
+        else f"cameras {', '.join(names)} send no frames{reason}"
+        for reason, names in together.items()
+    )

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from station.booth.collection import silence_in_words
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
@@ -50,7 +51,8 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     sync = processes["sync"]
     if not reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
-    problems += _cameras(sync, wanted=bool(processes["control"].get("streaming")))
+    hanging = {name for name in sync.get("silent", ()) if not reports(processes[f"capture {name}"])}
+    problems += _cameras(sync, hanging, wanted=bool(processes["control"].get("streaming")))
     problems += [
         str(problem)
         for content in processes.values()
@@ -85,23 +87,27 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     ]
 
 
-def _cameras(sync: dict[str, Any], *, wanted: bool) -> list[str]:
+def _cameras(sync: dict[str, Any], hanging: set[str], *, wanted: bool) -> list[str]:
     """Cameras whose frames are not what they should be.
 
     Args:
+        hanging: cameras whose process does not report, which is told of the process.
         wanted: the operator has started the sensors.
     """
     told: dict[str, dict[str, Any]] = sync.get("cameras", {})
     problems = [
         f"camera {name}: {camera['trouble']}" for name, camera in told.items() if camera["trouble"]
     ]
+    silent: dict[str, str] = {}
     for name in sync.get("silent", []) if wanted else []:
         state = told.get(name, {}).get("state", "off")
         # A sensor that is being opened is not silent yet; the process says when it cannot be.
-        if state in ("streaming", "lost"):
+        if state in ("streaming", "lost") and name not in hanging:
             detail = told[name]["detail"]
-            why = f" ({detail})" if detail else ""
-            problems.append(f"camera {name} sends no frames{why}; check its cable")
+            silent[name] = f" ({detail})" if detail else ""
+    if silent:
+        remedy = "check its cable" if len(silent) == 1 else "check their cables"
+        problems.append(f"{silence_in_words(silent)}; {remedy}")
     return problems
 
 

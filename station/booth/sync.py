@@ -12,7 +12,7 @@ from typing import Any
 import click
 import zmq
 
-from station.booth.collection import LATE, Collection, Order
+from station.booth.collection import LATE, Collection, Order, silence_in_words
 from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import LiveCloud, frameset_points, is_empty
@@ -224,11 +224,11 @@ class SyncProcess:
             current = self._order or (self._collection and self._collection.order)
             return f"scan {current and current.scan_id} is being taken; wait until it is done"
         if silent := self._silent():
-            return "; ".join(
-                f"camera {name} sends no frames{self._intake.why(name)}; "
-                "scan again in a few seconds; if it stays silent, check its cable, see station "
-                "status"
-                for name in silent
+            told = silence_in_words({name: self._intake.why(name) for name in silent})
+            return f"{told}; scan again in a few seconds; " + (
+                "if it stays silent, check its cable, see station status"
+                if len(silent) == 1
+                else "if they stay silent, check their cables, see station status"
             )
         return "; ".join(self._troubles())
 

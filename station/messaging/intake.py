@@ -81,7 +81,11 @@ class FrameIntake:
     def why(self, camera: str) -> str:
         """Reason, in brackets, that a camera's process reports for missing frames; may be empty."""
         health = self.health.get(camera)
-        return f" ({health.detail or health.state})" if health else ""
+        if health is None:
+            return ""
+        # The last that a hanging process reported is no reason.
+        why = health.detail or ("" if health.state == "streaming" else health.state)
+        return f" ({why})" if why else ""
 
     def _take(self, parts: list[memoryview]) -> LiveFrame | None:
         if len(parts) < 2:

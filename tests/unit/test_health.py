@@ -53,6 +53,20 @@ def test_a_silent_camera_is_named_once_the_sensors_are_started(config: BoothConf
     assert _problems(config, streaming=False, silent=["a"], cameras=cameras) == []
 
 
+def test_the_remedy_of_several_silent_cameras_is_said_once(config: BoothConfig) -> None:
+    cameras = {name: _camera("streaming") for name in _CAMERAS}
+    found = _problems(config, streaming=True, silent=["a", "b"], cameras=cameras)
+    assert found == ["cameras a, b send no frames; check their cables"]
+
+
+def test_a_camera_whose_process_hangs_is_not_sent_to_its_cable(config: BoothConfig) -> None:
+    cameras = {name: _camera("streaming") for name in _CAMERAS}
+    _problems(config, streaming=True, silent=["a"], cameras=cameras)
+    _tell(config, "capture a", age_s=5.0)
+    (problem,) = booth_health(config).problems
+    assert problem.startswith("the capture a process has not reported for 5 s")
+
+
 def test_a_camera_that_is_being_opened_is_no_problem(config: BoothConfig) -> None:
     cameras = {"a": _camera("opening"), "b": _camera("streaming")}
     assert _problems(config, streaming=True, silent=["a"], cameras=cameras) == []
