@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from station.calibration.detect.detections import EMPTY
 from station.core.errors import DriverError
 from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
@@ -49,8 +50,7 @@ def main() -> int:
         calibrate = [*STATION, "calibrate", "--recordings", str(booth / PROCEDURE)]
         if subprocess.run(calibrate, env=environment, check=False).returncode:
             return 1
-        # The detections are kept beside the calibration; the recordings take a gigabyte.
-        shutil.rmtree(booth / PROCEDURE)
+        discard(booth / PROCEDURE)
     compare(Rig.load(booth / "calibration.json"), Rig.load(booth / TRUTH))
     log = (booth / "station.log").open("w")
     print(f"starting the station (log: {log.name}) ...", flush=True)
@@ -66,6 +66,16 @@ def main() -> int:
         station.send_signal(signal.SIGTERM)
         station.wait(timeout=15)
     return done.returncode
+
+
+def discard(procedure: Path) -> None:
+    """Delete a calibration's recordings but the empty booth's, which `station check` can replay.
+
+    What was detected in them is kept beside the calibration; they take a gigabyte and a half.
+    """
+    for step in procedure.iterdir():
+        if step.name != EMPTY:
+            shutil.rmtree(step)
 
 
 def compare(found: Rig, truth: Rig) -> None:
