@@ -88,6 +88,17 @@ def test_recordings_are_replayed_through_capture_processes(tmp_path: Path) -> No
         assert (np.diff(values) > 0).all()
 
 
+def test_a_recording_that_is_too_short_is_told_how_long_it_has_to_be(
+    tmp_path: Path, one_camera: BoothConfig
+) -> None:
+    name = one_camera.cameras[0].name
+    _record(tmp_path / "step" / name, count=6)
+    with replayed_feed(one_camera, tmp_path / "step") as feed:
+        feed.cameras(20.0)
+        with pytest.raises(CalibrationError, match="its recording has to last 3 s or longer"):
+            gather_frames(feed, [name], 60, lambda _: None)
+
+
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     _record(tmp_path / "front")
     with (

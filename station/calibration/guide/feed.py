@@ -239,7 +239,13 @@ def gather_frames(
     few = [name for name, seen in taken.items() if len(seen) < frames // 2]
     if few:
         raise CalibrationError(
-            f"camera {', '.join(few)} gave too few frames; see station status and do it again"
+            f"camera {', '.join(few)} gave too few frames; "
+            + (
+                "its recording has to last 3 s or longer; stop other programs if the computer is "
+                "busy"
+                if feed.replays
+                else "see station status and do it again"
+            )
         )
     return taken
 

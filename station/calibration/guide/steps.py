@@ -154,6 +154,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
             "floor is seen by lower cameras), take your hands away, wait until it hangs still if "
             f"it hangs, and check that its radius is {session.radius_m:g} m "
             "(calibrate.ball_radius_m)"
+            + ("; a recording of it has to last 3 s or longer" if feed.replays else "")
         )
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
@@ -259,7 +260,10 @@ def wave_ball(
 
 
 def _too_slow(feed: Feed) -> str:
-    return f"this machine is too slow for the replay: {feed.missed} frames were missed"
+    return (
+        f"this machine is too slow for the replay: {feed.missed} frames were missed; stop other "
+        "programs if the computer is busy"
+    )
 
 
 def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
