@@ -14,10 +14,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from station.calibration.detect.board import Board
+from station.calibration.detect.detections import BallDetection
 from station.calibration.guide import raised_ball
 from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.calibrate_cli import calibrate
 from station.calibration.guide.operator import Guide
+from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import BoothError, CalibrationError
@@ -113,6 +115,31 @@ def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore)
     _begin(store)
     listed = _run(config, "--list").output
     assert listed == "  unfinished, started 2026-11-21T10:00:00Z: nothing yet\n"
+
+
+@pytest.mark.parametrize(
+    ("balls", "following"),
+    [(0, "goes through the steps that are missing"), (1, "solve puts it into use")],
+)
+def test_a_step_says_what_comes_next(
+    config: Path,
+    store: CalibrationStore,
+    monkeypatch: pytest.MonkeyPatch,
+    balls: int,
+    following: str,
+) -> None:
+    """After the empty booth, which begins another calibration, solve was named, and refused."""
+    session = _begin(store)
+    session.balls += balls * [
+        BallDetection(
+            next(iter(CAMERAS)), 0.0, np.zeros(3), np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4))
+        )
+    ]
+    monkeypatch.setattr(Procedure, "empty", lambda _: None)
+    monkeypatch.setattr(Procedure, "unfinished_session", lambda _: session)
+    done = _run(config, "floor")
+    assert done.exit_code == 0, done.output
+    assert f"kept, and not in use yet: station calibrate {following}" in done.output
 
 
 def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationStore) -> None:

@@ -95,7 +95,14 @@ def _step(command: Callable[..., None]) -> Callable[..., Any]:
     @functools.wraps(command)
     def wrapped(procedure: Procedure, **kwargs: Any) -> None:
         command(procedure, **kwargs)
-        click.echo("  kept, and not in use yet: station calibrate solve puts it into use")
+        session = procedure.unfinished_session()
+        # The empty booth begins another calibration where none is being done.
+        following = (
+            "station calibrate solve puts it into use"
+            if session is not None and session.balls
+            else "station calibrate goes through the steps that are missing"
+        )
+        click.echo(f"  kept, and not in use yet: {following}")
 
     return wrapped
 
@@ -109,8 +116,8 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
     """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
 
     Without a step all of them are done, guided, from where the last attempt ended. A step by itself
-    adds to the calibration that is being done, or else to the one in use; solve then puts the
-    result into use. Every result is a dated folder; the previous ones are kept.
+    adds to the calibration that is being done, or else to the one in use (floor begins another);
+    solve then puts the result into use. Every result is a dated folder; the previous ones are kept.
 
     \b
     Examples:
@@ -159,6 +166,9 @@ def _list(procedure: Procedure) -> None:
 @_step
 def floor(procedure: Procedure) -> None:
     """Look at the empty booth: its floor, and what always stands there.
+
+    Without an unfinished calibration it begins another, in which all steps are done again: what is
+    seen of the ball and the board is seen before this background.
 
     \b
     Examples:

@@ -112,7 +112,13 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "solve":
                 procedure.solve()
     if step not in ("all", "solve"):
-        guide.say("kept, and not in use yet: the computation puts it into use")
+        session = procedure.unfinished_session()
+        following = (
+            "the computation puts it into use"
+            if session is not None and session.balls
+            else "station calibrate goes through the steps that are missing"
+        )
+        guide.say(f"kept, and not in use yet: {following}")
 
 
 def main() -> int:
