@@ -142,6 +142,31 @@ def test_a_step_says_what_comes_next(
     assert f"kept, and not in use yet: station calibrate {following}" in done.output
 
 
+def test_the_folder_above_the_recordings_names_the_right_one(config: Path) -> None:
+    """The cameras' own recordings, front-lower, were taken for the step in front of the mark; the
+    remedy was to take them away."""
+    booth = config.parent
+    (booth / "procedure/empty").mkdir(parents=True)
+    (booth / "front-lower").mkdir()
+    refused = _run(config, "--recordings", str(booth))
+    assert isinstance(refused.exception, CalibrationError)
+    assert str(refused.exception).endswith(f"--recordings {booth / 'procedure'}")
+
+
+@pytest.mark.parametrize(
+    ("recorded", "words", "remedy"),
+    [("hanging-1800", (), "add --hanging"), ("stand-1800", ("--hanging",), "leave --hanging out")],
+)
+def test_a_forgotten_hanging_is_named(
+    config: Path, recorded: str, words: tuple[str, ...], remedy: str
+) -> None:
+    recordings = config.parent / "procedure"
+    (recordings / recorded).mkdir(parents=True)
+    refused = _run(config, "stand", "--height", "1.8", *words, "--recordings", str(recordings))
+    assert isinstance(refused.exception, CalibrationError)
+    assert f"but {recorded}: {remedy}" in str(refused.exception)
+
+
 def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationStore) -> None:
     """The operator had set up the board before he was told."""
     _begin(store)

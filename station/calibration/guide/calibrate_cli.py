@@ -128,12 +128,16 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
       station calibrate --list
       station calibrate --use 20261121T100000Z
     """
+    from station.calibration.guide.recordings import check_folder
+
     if list_them:
         _list(procedure)
     elif use_name:
         entry = procedure.store.use(use_name)
         click.echo(f"calibration {entry.name} is in use: {procedure.store.in_use}")
     else:
+        if procedure.recordings is not None:
+            check_folder(procedure.recordings)
         if new and (aside := procedure.store.set_aside()):
             click.echo(f"what was seen so far is kept in {aside}")
         procedure.run()
@@ -249,9 +253,13 @@ def stand(procedure: Procedure, height_m: float | None, hanging: bool) -> None:
       station calibrate stand --height 0.7 --hanging
     """
     from station.calibration.guide.raised_ball import see_all_heights, see_height
+    from station.calibration.guide.recordings import check_height
 
     if height_m is not None:
-        see_height(procedure, height_m, HANGING if hanging else STAND)
+        kind = HANGING if hanging else STAND
+        if procedure.recordings is not None:
+            check_height(procedure.recordings, kind, height_m)
+        see_height(procedure, height_m, kind)
     elif procedure.guide.attended or procedure.recordings is not None:
         see_all_heights(procedure, again=True, kind=HANGING if hanging else None)
     else:
