@@ -117,6 +117,28 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     assert tasks.state()["error"] == ""
 
 
+_TWO_STEPS = """
+import json, sys
+def say(**words): print(json.dumps(words), flush=True)
+say(kind="step", title="Ball", text="", waits=False)
+say(kind="line", text="more positions would help")
+say(kind="step", title="Ball on the mark", text="", waits=True)
+sys.stdin.readline()
+say(kind="done", text="the ball at rest is seen by front-lower")
+"""
+
+
+def test_what_a_step_complained_of_is_not_said_of_the_next(tmp_path: Path) -> None:
+    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    tasks._begin("calibrate", "all", [sys.executable, "-c", _TWO_STEPS])
+    _until(lambda: bool(tasks.state()["waits_for"]))
+    assert tasks.state()["lines"] == ["more positions would help"]
+    assert tasks.state()["step_lines"] == 0
+    tasks.answer("go")
+    _until(lambda: not tasks.state()["running"])
+    assert (len(tasks.state()["lines"]), tasks.state()["step_lines"]) == (2, 1)
+
+
 def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
     tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
     command = [sys.executable, "-c", _ASKS]

@@ -266,4 +266,5 @@ class Task(BaseModel):
     waits_for: str
     countdown_s: int | None
     lines: list[str]
+    step_lines: int = Field(description="how many of the last lines are of the current step")
     error: str

@@ -159,7 +159,7 @@ class Tasks:
             match said.get("kind"):
                 case "step":
                     state |= {"title": said["title"], "instruction": text}
-                    state |= {"progress": "", "question": ""}
+                    state |= {"progress": "", "question": "", "step_lines": 0}
                     state["waits_for"] = "go" if said.get("waits") else ""
                 case "countdown":
                     state["countdown_s"] = said["left_s"] or None
@@ -171,6 +171,7 @@ class Tasks:
                     state |= {"question": text, "waits_for": "height"}
                 case "line" | "done":
                     state["lines"] = [*state["lines"], text][-_LINES_KEPT:]
+                    state["step_lines"] = min(state["step_lines"] + 1, _LINES_KEPT)
                 case "error":
                     state["error"] = text
         self._tell()
@@ -189,5 +190,6 @@ class Tasks:
 def _idle() -> dict[str, Any]:
     return {
         "kind": "", "step": "", "running": False, "title": "", "instruction": "", "progress": "",
-        "question": "", "waits_for": "", "countdown_s": None, "lines": [], "error": "",
+        "question": "", "waits_for": "", "countdown_s": None, "lines": [], "step_lines": 0,
+        "error": "",
     }  # fmt: skip

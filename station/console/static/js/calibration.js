@@ -10,6 +10,7 @@ import { settings } from './settings.js';
 const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
 const LOWEST_M = 0.3;
 const HIGHEST_M = 2.2;
+const LINES_SHOWN = 6;
 const COMMAND = new RegExp(`station calibrate(?: (--new|(?:${STEPS.join('|')})\\b))?(?: --[a-z]+)*`, 'g');
 
 // What the station says; the commands that it names are buttons here.
@@ -35,10 +36,11 @@ export async function calibration(main, session) {
   const button = (step) => { const one = h('button', { 'data-step': step, onclick: () => begin(step), 'aria-label': `${t('cal.do')}: ${t(`cal.${step}`)}` }, t('cal.do')); buttons.push(one); return one; };
 
   function idle(task) {
-    const tell = task.kind === 'calibrate' && (task.error || task.lines.length);
+    const told = task.kind === 'calibrate';
+    const tell = told && (task.error || task.lines.length);
     now.className = 'card';
     now.replaceChildren(h('h2', {}, t('cal.all')),
-      task.error ? h('div', { className: 'banner bad', id: 'task-error' }, said(task.error)) : '',
+      told && task.error ? h('div', { className: 'banner bad', id: 'task-error' }, said(task.error)) : '',
       session.recordings ? h('p', { className: 'soft' }, t('cal.recordings')) : '',
       h('div', { className: 'actions left' },
         h('button', { className: 'primary', id: 'calibrate', onclick: () => begin('all') }, t('cal.continue')),
@@ -77,7 +79,7 @@ export async function calibration(main, session) {
         task.waits_for === 'height' ? h('button', { id: 'leave-out', onclick: () => say('no') }, t('cal.leaveOut')) : '',
         h('button', { className: 'danger', id: 'halt', onclick: halt }, t('cal.stop'))),
       task.waits_for ? '' : h('div', {}, h('p', { className: 'soft' }, said(task.progress) || ' '), bar),
-      h('div', { className: 'log', id: 'log' }, task.lines.slice(-6).map((line) => h('div', {}, said(line)))));
+      h('div', { className: 'log', id: 'log' }, task.lines.slice(task.lines.length - Math.min(task.step_lines, LINES_SHOWN)).map((line) => h('div', {}, said(line)))));
   }
 
   function show(task) {
