@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from station.calibration.detect.detections import EMPTY
+from station.calibration.detect.step_names import EMPTY
 from station.core.errors import DriverError
 from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
