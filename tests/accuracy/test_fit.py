@@ -1,6 +1,7 @@
 """The fit on a body that the model was not trained on, seen through the simulated sensors."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -228,6 +229,36 @@ def test_legs_without_feet_do_not_end_on_the_floor(model: BodyModel, cut_m: floa
     ends_below = {"height", "crotch_height", "outside_leg_length_left", "calf_girth_right"}
     assert ends_below <= blank
     assert blank.isdisjoint({"waist_girth", "chest_girth", "head_girth", "upper_arm_girth_left"})
+
+
+@pytest.mark.parametrize(
+    ("cut_m", "below_m", "words"),
+    [
+        (0.01, 0.0, r"the feet end \d+ mm below the lowest points of the cloud"),
+        (0.02, 0.0, r"the feet end \d+ mm below the lowest points of the cloud"),
+        (0.0, 0.015, r"the lowest points of the cloud lie 1[3-5] mm below the feet"),
+        (0.0, 0.3, r"the lowest points of the cloud lie (29|30)\d mm below the feet"),
+    ],
+)
+def test_lowest_points_that_are_no_soles_do_not_pass_for_them(
+    model: BodyModel, cut_m: float, below_m: float, words: str
+) -> None:
+    """Heights were off by as much, to +-1.3 mm, with "ok"."""
+    normals = vertex_normals(model.mean, model.faces)
+    kept = model.mean[:, 2] > cut_m
+    points = np.concatenate([model.mean[kept], [[0.0, 0.0, cut_m - below_m]]])
+    points -= (0.0, 0.0, points[:, 2].min())
+    directions = np.concatenate([normals[kept], [[0.0, 0.0, -1.0]]])
+    count = len(points)
+    cloud = PointCloud(
+        points, directions, np.full(count, 1e-3), np.zeros(count, np.int16), ("cloud",)
+    )
+    fit = fit_body(model, Preprocessed(cloud, (), ()))
+    assert any(re.match(words, reason) for reason in fit.verdict.reasons)
+    rows = measure_body(model, fit.overlapping, fit.vertex_sigma_m, fit.vertex_seen).rows
+    blank = {row.name for row in rows if row.parts & fit.verdict.missing_parts}
+    assert {"height", "crotch_height", "outside_leg_length_left"} <= blank
+    assert blank.isdisjoint({"waist_girth", "chest_girth"})
 
 
 @pytest.mark.parametrize("cut_m", [0.14, 0.2])

@@ -20,6 +20,10 @@ POSSIBLE_HEIGHTS_M = (1.0, 2.6)
 
 RAISED_FLOOR = "floor-raised"
 """Code of the finding that a person stands on something: heights are not those above z = 0."""
+UNKNOWN_FLOOR = "floor-unknown"
+"""Code of the finding that a bare cloud does not show where the floor is."""
+OFF_FLOOR = frozenset({RAISED_FLOOR, UNKNOWN_FLOOR})
+"""Codes after which nothing is measured that ends on the floor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +31,7 @@ class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or `RAISED_FLOOR`."""
+    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or one of `OFF_FLOOR`."""
     camera: str | None
     value: float | None
     message: str

@@ -32,7 +32,14 @@ from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
-from workers.scape.fit.posture import arms_inside, feet_cut_off, head_cut_off, head_turned, leaning
+from workers.scape.fit.posture import (
+    arms_inside,
+    feet_cut_off,
+    head_cut_off,
+    head_turned,
+    leaning,
+    off_floor,
+)
 from workers.scape.fit.sampling import Sampling
 from workers.scape.fit.unmatched import Patch, unmatched_patches
 from workers.scape.fit.verdict import (
@@ -233,7 +240,9 @@ def separate_limbs(
     observer("surface", {"vertices": vertices, "residual_m": surface.residual_m})
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
-    findings = [*findings, *leaning(model, rotations)]
+    noticed = [*findings, *leaning(model, rotations)]
+    if fit.reference is not None and not fit.camera_shifts_m:
+        noticed += off_floor(model, fit.reference)
     misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
     if not fit.camera_shifts_m:
         misplaced |= feet_cut_off(model, vertices, fit.cloud.points)
@@ -242,7 +251,7 @@ def separate_limbs(
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, findings, lost, stature_m, beta, shifts, rms_m, misplaced)
+    verdict = judge(parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.cloud.observed import RAISED_FLOOR, Finding, PointCloud
+from workers.cloud.observed import OFF_FLOOR, Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
@@ -190,7 +190,7 @@ def judge(
 
     Args:
         sides: what `sides_seen` gives.
-        findings: what preprocessing and `leaning` noticed; each is a reason.
+        findings: what preprocessing, `leaning` and `off_floor` noticed; each is a reason.
         lost: what `lost_parts` gives.
         beta: (B,), shape coefficients.
         camera_shifts_m: how far the fit moved each camera's points.
@@ -228,7 +228,7 @@ def judge(
     if not camera_shifts_m and not _FEET.isdisjoint(missing):
         # Only feet show where the floor of a bare cloud is; legs without them were pressed to it.
         missing += [FLOOR, *(part for limb in _limbs() if limb[-1] in _FEET for part in limb[1:])]
-    missing += [FLOOR for finding in findings if finding.code == RAISED_FLOOR]
+    missing += [FLOOR for finding in findings if finding.code in OFF_FLOOR]
     if everywhere:
         missing += [part.name for part in parts]
     elif halves or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
