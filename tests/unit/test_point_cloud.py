@@ -22,7 +22,7 @@ def _written(path: Path, points: np.ndarray) -> Path:
 
 
 def test_a_cloud_goes_back_to_where_it_was(tmp_path: Path) -> None:
-    points = np.random.default_rng(1).uniform((1.0, 5.0, -3.0), (2.0, 6.0, -1.0), (2000, 3))
+    points = _person(np.random.default_rng(1)) + np.array([1.0, 5.0, -3.0])
     cloud = read_cloud(_written(tmp_path / "a.ply", points), "z")
     assert np.allclose(cloud.points + cloud.origin_m, points, atol=1e-6)
     assert cloud.points[:, 2].min() == 0.0
@@ -47,6 +47,16 @@ def test_soles_that_no_camera_saw_are_not_the_floor(
     points[:, 2] += low_m - points[:, 2].min()
     cloud = read_cloud(_written(tmp_path / "cloud.ply", points), "z")
     assert cloud.origin_m[2] == pytest.approx(floor_m, abs=1e-6)
+
+
+@pytest.mark.parametrize("below_m", [0.01, 0.02, 0.05, 0.3])
+def test_a_stray_point_below_the_soles_is_none_of_them(tmp_path: Path, below_m: float) -> None:
+    """Heights were too large by as much, to +-1.3 mm, with "ok"."""
+    points = _sampled("ann", 20_000)[0] + np.array([0.0, 0.0, 0.5])
+    low_m = float(points[:, 2].min())
+    stray = points[[np.argmin(points[:, 2])]] - (0.0, 0.0, below_m)
+    cloud = read_cloud(_written(tmp_path / "a.ply", np.concatenate([points, stray])), "z")
+    assert cloud.origin_m[2] == pytest.approx(low_m, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -152,15 +162,21 @@ def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:
 
 def test_normals_between_limbs_point_outwards(tmp_path: Path) -> None:
     """Skin between limbs, where another limb lies behind it and before it, is oriented too."""
-    body = np.load(BODIES / "ann.npz")
+    points, directions = _sampled("ann", 20_000)
+    bare = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    o3d.io.write_point_cloud(tmp_path / "bare.ply", bare)
+    normals = read_cloud(tmp_path / "bare.ply", "z").normals
+    outwards = np.einsum("ni,ni->n", normals, directions) > 0.0
+    assert outwards.mean() > 0.96
+
+
+def _sampled(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a body's skin, and its normals there."""
+    body = np.load(BODIES / f"{name}.npz")
     surface = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(body["vertices"]), o3d.utility.Vector3iVector(body["faces"])
     )
     surface.compute_triangle_normals()
     o3d.utility.random.seed(5)
-    sampled = surface.sample_points_uniformly(20_000, use_triangle_normal=True)
-    bare = o3d.geometry.PointCloud(sampled.points)
-    o3d.io.write_point_cloud(tmp_path / "bare.ply", bare)
-    normals = read_cloud(tmp_path / "bare.ply", "z").normals
-    outwards = np.einsum("ni,ni->n", normals, np.asarray(sampled.normals)) > 0.0
-    assert outwards.mean() > 0.96
+    sampled = surface.sample_points_uniformly(count, use_triangle_normal=True)
+    return np.asarray(sampled.points), np.asarray(sampled.normals)

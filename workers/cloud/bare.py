@@ -1,0 +1,71 @@
+"""Points of a bare cloud beside the skin that those around them lie on: strays, and scatter."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_NEIGHBOUR, _FAR_RATIO, _FAR_M = 6, 5.0, 0.02
+"""A point is alone if its neighbour of this rank is so many times as far as those of half the
+points, and so far."""
+_PATCH = 24
+"""Neighbours that a patch of skin is fitted to."""
+_PATCHES = 4000
+"""Patches that the scatter is found from."""
+_SMOOTH_SHARE = 0.25
+"""Share of them that lies where the skin is smooth, so that their scatter is the points' own."""
+_LOWEST = 2000
+"""Lowest points among which strays are looked for."""
+_OFF_RATIO, _OFF_M, _BESIDE_RATIO = 4.0, 0.004, 3.0
+"""A stray point is so many times as far from a patch as the patch's own points, and so far, or so
+many times their distance beside it."""
+_TERMS = 6
+"""Coefficients of a patch."""
+
+
+def not_alone(points: Array) -> Mask:
+    """Points (n,) of a cloud (n, 3) that have others around them."""
+    away = cKDTree(points).query(points, _NEIGHBOUR + 1, workers=-1)[0][:, -1]
+    return np.asarray(away <= max(_FAR_RATIO * float(np.median(away)), _FAR_M))
+
+
+def lowest_m(points: Array) -> float:
+    """Height of the lowest of a cloud's points (n, 3) that lie on skin."""
+    low = np.argsort(points[:, 2], kind="stable")[:_LOWEST]
+    around = cKDTree(points).query(points[low], _PATCH + 1, workers=-1)[1][:, 1:]
+    rms, off, beside = _patches(points[around], points[low])
+    stray = (off > np.maximum(_OFF_RATIO * rms, _OFF_M)) | (beside > _BESIDE_RATIO)
+    return float(points[low[0 if stray.all() else int(np.argmin(stray))], 2])
+
+
+def scatter_m(points: Array) -> float:
+    """Standard deviation of a cloud's points (n, 3) about the skin."""
+    chosen = points[:: max(1, len(points) // _PATCHES)]
+    around = cKDTree(points).query(chosen, _PATCH, workers=-1)[1]
+    return float(np.quantile(_patches(points[around], chosen)[0], _SMOOTH_SHARE))
+
+
+def _patches(around: Array, places: Array) -> tuple[Array, Array, Array]:
+    """Rms distances of neighbours (n, k, 3) from the quadrics through them, the places' (n, 3)
+    distances from these, and how far beside the neighbours they lie, in units of their extent.
+    """
+    middle = around.mean(axis=1, keepdims=True)
+    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around - middle, around - middle))[1]
+    above, x, y = np.moveaxis((around - middle) @ axes, 2, 0)
+    extent = np.sqrt(np.mean(x * x + y * y, axis=1, keepdims=True))
+    basis = _terms(x / extent, y / extent)
+    coefficients = np.linalg.pinv(basis) @ above[..., None]
+    rest = above - (basis @ coefficients)[..., 0]
+    rms = np.sqrt(np.sum(rest**2, axis=1) / (around.shape[1] - _TERMS))
+    height, u, v = np.moveaxis((places[:, None] - middle) @ axes, 2, 0)
+    u, v = u / extent, v / extent
+    off = height - (_terms(u, v) @ coefficients)[..., 0]
+    return rms, np.abs(off[:, 0]), np.hypot(u, v)[:, 0]
+
+
+def _terms(x: Array, y: Array) -> Array:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
