@@ -234,10 +234,10 @@ def test_legs_without_feet_do_not_end_on_the_floor(model: BodyModel, cut_m: floa
 @pytest.mark.parametrize(
     ("cut_m", "below_m", "words"),
     [
-        (0.01, 0.0, r"the feet end \d+ mm below the lowest points of the cloud"),
+        (0.015, 0.0, r"the feet end \d+ mm below the lowest points of the cloud"),
         (0.02, 0.0, r"the feet end \d+ mm below the lowest points of the cloud"),
-        (0.0, 0.015, r"the lowest points of the cloud lie 1[3-5] mm below the feet"),
-        (0.0, 0.3, r"the lowest points of the cloud lie (29|30)\d mm below the feet"),
+        (0.0, 0.015, r"the feet end 1[3-5] mm above the floor of the cloud"),
+        (0.0, 0.3, r"the feet end (29|30)\d mm above the floor of the cloud"),
     ],
 )
 def test_lowest_points_that_are_no_soles_do_not_pass_for_them(
