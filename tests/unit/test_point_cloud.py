@@ -9,7 +9,9 @@ import pytest
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from workers.cloud import cloud_file
+from workers.cloud.bare import floor_sigma_m, roughness
 from workers.cloud.cloud_file import read_cloud
+from workers.cloud.observed import PointCloud
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
@@ -180,3 +182,23 @@ def _sampled(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     o3d.utility.random.seed(5)
     sampled = surface.sample_points_uniformly(count, use_triangle_normal=True)
     return np.asarray(sampled.points), np.asarray(sampled.normals)
+
+
+def test_noise_widens_heights_and_is_named(tmp_path: Path) -> None:
+    """2 mm of it put the floor 3 mm too low, 3 mm took girths with them, with "ok"."""
+    points = _sampled("ann", 40_000)[0]
+    rng = np.random.default_rng(6)
+
+    def read(noise_m: float) -> PointCloud:
+        noisy = points + rng.normal(0.0, noise_m, points.shape)
+        return read_cloud(_written(tmp_path / f"{noise_m}.ply", noisy), "z")
+
+    assert floor_sigma_m(read(0.0)) < 5e-4
+    slight, strong = read(0.0015), read(0.003)
+    assert slight.scatter_m == pytest.approx(0.0014, abs=2e-4)
+    assert floor_sigma_m(slight) > 0.0015
+    assert roughness(slight) == ()
+    (finding,) = roughness(strong)
+    assert finding.message.startswith("the points scatter by 2.6 mm about the skin")
+    few = read_cloud(_written(tmp_path / "few.ply", points[:1600]), "z")
+    assert roughness(few)

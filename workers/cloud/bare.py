@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from workers.cloud.observed import Finding, PointCloud
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -23,6 +25,12 @@ _LOWEST = 2000
 _OFF_RATIO, _OFF_M, _BESIDE_RATIO = 4.0, 0.004, 3.0
 """A stray point is so many times as far from a patch as the patch's own points, and so far, or so
 many times their distance beside it."""
+_MOST_SCATTER_M = 0.002
+"""Scatter from which a cloud is too rough, or has too few points, to be measured: rows are up to
+20 mm off with 2.2, of 5000 points, or of 60,000 with 2.5 mm of noise."""
+_FLOOR_PER_SCATTER = 1.5
+"""Standard deviation of where lowest points put the floor: noise puts it 1 to 3 mm too low with a
+scatter of 1.8, and few points 1 to 3 mm too high with 0.7."""
 _TERMS = 6
 """Coefficients of a patch."""
 
@@ -47,6 +55,22 @@ def scatter_m(points: Array) -> float:
     chosen = points[:: max(1, len(points) // _PATCHES)]
     around = cKDTree(points).query(chosen, _PATCH, workers=-1)[1]
     return float(np.quantile(_patches(points[around], chosen)[0], _SMOOTH_SHARE))
+
+
+def floor_sigma_m(cloud: PointCloud) -> float:
+    """Standard deviation of heights above a cloud's lowest points."""
+    return _FLOOR_PER_SCATTER * cloud.scatter_m
+
+
+def roughness(cloud: PointCloud) -> tuple[Finding, ...]:
+    """The finding that a cloud's points lie too far from the skin, where they do."""
+    if cloud.scatter_m < _MOST_SCATTER_M:
+        return ()
+    message = (
+        f"the points scatter by {1e3 * cloud.scatter_m:.1f} mm about the skin, or are too few: "
+        "smooth the cloud, or take more points"
+    )
+    return (Finding("rough", None, cloud.scatter_m, message),)
 
 
 def _patches(around: Array, places: Array) -> tuple[Array, Array, Array]:

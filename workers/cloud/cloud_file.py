@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
-from workers.cloud.bare import lowest_m, not_alone
+from workers.cloud.bare import lowest_m, not_alone, scatter_m
 from workers.cloud.floor import UNITS_M, Z_UP, check_units, standing_on
 from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 from workers.cloud.pcd import check_pcd
@@ -103,6 +103,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         camera=np.zeros(len(points), np.int16),
         camera_names=("cloud",),
         origin_m=(x, y, z),
+        scatter_m=scatter_m(points),
     )
 
 

@@ -31,7 +31,8 @@ class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind", "frames-missing", "leaning" or one of `OFF_FLOOR`."""
+    """"motion", "two-people", "camera-blind", "frames-missing", "leaning", "rough", or one of
+    `OFF_FLOOR`."""
     camera: str | None
     value: float | None
     message: str
@@ -64,6 +65,8 @@ class PointCloud:
     camera_names: tuple[str, ...]
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The origin of a bare cloud's points in its own frame, turned z up."""
+    scatter_m: float = 0.0
+    """Standard deviation of a bare cloud's points about the skin; 0 where cameras say it."""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -19,6 +19,7 @@ import numpy as np
 from station.core.bundle import read_bundle
 from station.core.config import Volume
 from station.core.rig import PredictedError
+from workers.cloud.bare import floor_sigma_m, roughness
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.cloud.preprocess import warm_up as compile_preprocessing
@@ -140,7 +141,7 @@ def reconstruct_cloud(
     with watch.step("load"):
         model = model or load_model()
     with watch.step("preprocess"):
-        scan = Preprocessed(cloud, (), ())
+        scan = Preprocessed(cloud, (), roughness(cloud))
     return _fitted(model, scan, Origin(scan_id), method, out_folder, watch, progress, observer)
 
 
@@ -219,7 +220,7 @@ def scan_errors(
     )
     errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m, skin_sigma_m=skin)
     if predicted is None:
-        return errors
+        return replace(errors, height_sigma_m=floor_sigma_m(fit.cloud))
     return replace(
         errors, height_sigma_m=predicted.height_sigma_m, girth_sigma_m=predicted.girth_sigma_m
     )
