@@ -9,11 +9,10 @@ from scipy.spatial import cKDTree
 from workers.cloud.observed import Finding, PointCloud
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _NEIGHBOUR, _FAR_RATIO, _FAR_M = 6, 5.0, 0.02
-"""A point is alone if its neighbour of this rank is so many times as far as those of half the
-points, and so far."""
+"""A stray point's neighbour of this rank is so many times as far as those of half the points, and
+so far, ..."""
 _PATCH = 24
 """Neighbours that a patch of skin is fitted to."""
 _PATCHES = 4000
@@ -23,8 +22,8 @@ _SMOOTH_SHARE = 0.25
 _LOWEST = 2000
 """Lowest points among which strays are looked for."""
 _OFF_RATIO, _OFF_M, _BESIDE_RATIO = 4.0, 0.004, 3.0
-"""A stray point is so many times as far from a patch as the patch's own points, and so far, or so
-many times their distance beside it."""
+"""... or it is so many times as far from a patch as the patch's own points, and so far, or so many
+times their distance beside it."""
 _MOST_SCATTER_M = 0.002
 """Scatter from which a cloud is too rough, or has too few points, to be measured: rows are up to
 20 mm off with 2.2, of 5000 points, or of 60,000 with 2.5 mm of noise."""
@@ -35,18 +34,14 @@ _TERMS = 6
 """Coefficients of a patch."""
 
 
-def not_alone(points: Array) -> Mask:
-    """Points (n,) of a cloud (n, 3) that have others around them."""
-    away = cKDTree(points).query(points, _NEIGHBOUR + 1, workers=-1)[0][:, -1]
-    return np.asarray(away <= max(_FAR_RATIO * float(np.median(away)), _FAR_M))
-
-
 def lowest_m(points: Array) -> float:
     """Height of the lowest of a cloud's points (n, 3) that lie on skin."""
     low = np.argsort(points[:, 2], kind="stable")[:_LOWEST]
-    around = cKDTree(points).query(points[low], _PATCH + 1, workers=-1)[1][:, 1:]
-    rms, off, beside = _patches(points[around], points[low])
-    stray = (off > np.maximum(_OFF_RATIO * rms, _OFF_M)) | (beside > _BESIDE_RATIO)
+    away_m, around = cKDTree(points).query(points[low], _PATCH + 1, workers=-1)
+    rms, off, beside = _patches(points[around[:, 1:]], points[low])
+    near_m = away_m[:, _NEIGHBOUR]
+    stray = near_m > max(_FAR_RATIO * float(np.median(near_m)), _FAR_M)
+    stray |= (off > np.maximum(_OFF_RATIO * rms, _OFF_M)) | (beside > _BESIDE_RATIO)
     return float(points[low[0 if stray.all() else int(np.argmin(stray))], 2])
 
 

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
-from workers.cloud.bare import lowest_m, not_alone, scatter_m
+from workers.cloud.bare import lowest_m, scatter_m
 from workers.cloud.floor import UNITS_M, Z_UP, check_units, standing_on
 from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
 from workers.cloud.pcd import check_pcd
@@ -58,8 +58,8 @@ _OFF_FLOOR_M = 0.05
 def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     """Read a cloud and move its middle to the mark and its lowest points, or its floor, to z = 0.
 
-    A floor that was scanned too is taken away, and what stands apart on it; so are single points
-    away from all others, and such below the soles are not taken for these. A cloud whose lowest
+    A floor that was scanned too is taken away, and what stands apart on it. Single points below
+    the soles are not taken for these. A cloud whose lowest
     points are slightly above z = 0, as where no camera saw the soles, keeps its heights.
     `origin_m` of the cloud is the new origin in the file's frame, in metres, after `up`. The same
     file gives the same points.
@@ -82,8 +82,8 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
             f"{path} has points {extent_m:.4g} m apart; cut the person out, or name its --unit"
         )
     person = standing_on(np.asarray(cloud.points))
-    kept = not_alone(np.asarray(cloud.points)) if person is None else person[0]
-    cloud = cloud.select_by_index(np.flatnonzero(kept))
+    if person is not None:
+        cloud = cloud.select_by_index(np.flatnonzero(person[0]))
     if not _has_unit_normals(cloud):
         _estimate_normals(cloud, path)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
