@@ -202,3 +202,14 @@ def test_noise_widens_heights_and_is_named(tmp_path: Path) -> None:
     assert finding.message.startswith("the points scatter by 2.6 mm about the skin")
     few = read_cloud(_written(tmp_path / "few.ply", points[:1600]), "z")
     assert roughness(few)
+
+
+@pytest.mark.parametrize("mat_m", [0.003, 0.008, -0.01])
+def test_a_person_stands_on_what_lies_around_the_feet(tmp_path: Path, mat_m: float) -> None:
+    """The plane of the whole floor lies below a mat: heights were 2 to 7 mm too large."""
+    rng = np.random.default_rng(8)
+    floor = np.column_stack([rng.uniform(-1.0, 1.0, (40_000, 2)), rng.normal(0.0, 0.001, 40_000)])
+    floor[(np.abs(floor[:, :2]) < 0.4).all(axis=1), 2] += mat_m
+    body = _sampled("ann", 20_000)[0] + np.array([0.0, 0.0, mat_m])
+    cloud = read_cloud(_written(tmp_path / "a.ply", np.concatenate([body, floor])), "z")
+    assert cloud.origin_m[2] == pytest.approx(mat_m, abs=0.001)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
 from workers.cloud.observed import POSSIBLE_HEIGHTS_M
@@ -35,6 +36,9 @@ _LOWEST_SHARE = 0.3
 """Share of the cloud's height in which a floor is searched for."""
 _CLEARANCE_M = 0.015
 """Points so near to the floor are taken away with it: noise of the floor, and soles."""
+_FOOT_M, _AROUND_FEET_M, _FEWEST_NEAR = 0.06, 0.15, 50
+"""Height of feet above the floor, how far around them it is what they stand on, and its fewest
+points."""
 _VOXEL_M = 0.04
 _PLANE_ROUNDS = 4
 _LEVEL = np.tan(np.radians(1.5))
@@ -102,12 +106,31 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
         near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _CLEARANCE_M
     if np.linalg.norm(plane[:2]) > _LEVEL:
         raise _not_level(float(np.arctan(np.linalg.norm(plane[:2]))))
-    over = points[:, 2] - points[:, :2] @ plane[:2] - plane[2] > _CLEARANCE_M
+    above_m = points[:, 2] - points[:, :2] @ plane[:2] - plane[2]
+    over = above_m > _CLEARANCE_M
     person = np.flatnonzero(over)[_largest_piece(points[over])]
+    plane[2] += _under_feet_m(points, above_m, person)
     kept = np.zeros(len(points), bool)
     kept[person] = True
     middle = np.median(points[person, :2], axis=0)
     return kept, float(middle @ plane[:2] + plane[2])
+
+
+def _under_feet_m(points: Array, above_m: Array, person: NDArray[np.intp]) -> float:
+    """Height above the whole floor's plane of what lies around the feet: a mat, or a dip.
+
+    Args:
+        points: (n, 3).
+        above_m: (n,), their heights above the plane.
+        person: indices of the person's.
+    """
+    feet = points[person[above_m[person] < _FOOT_M], :2]
+    floor = np.abs(above_m) < _CLEARANCE_M
+    if not len(feet):
+        return 0.0
+    beside = cKDTree(feet).query(points[floor, :2], distance_upper_bound=_AROUND_FEET_M)[0]
+    near = np.isfinite(beside)
+    return float(np.median(above_m[floor][near])) if near.sum() >= _FEWEST_NEAR else 0.0
 
 
 def _floor_band(points: Array) -> float | None:
