@@ -294,3 +294,18 @@ def test_depths_that_changed_everywhere_are_no_moved_cameras(sign: float) -> Non
     assert depths_words([aside, *moves[1:]]) is None
     opposite = replace(moves[0], xi=-moves[0].xi)
     assert depths_words([opposite, *moves[1:]]) is None
+    turned = [replace(move, xi=move.xi + np.array([0.03, 0, 0, 0, 0, 0])) for move in moves]
+    assert depths_words(turned) is None
+
+
+def test_depths_that_changed_are_told_in_front_of_plain_walls() -> None:
+    """The shift along a wall is hardly known there, and was taken for a move."""
+    moves = []
+    for name in ("front-upper", "back-lower"):
+        camera = default_rig().cameras[name]
+        view = VirtualScene(booth_walls()).view(camera, camera.world_from_camera)
+        frames = _frames(view, 30, seed=4)
+        before = DriftReference.prepare(camera, static_view(frames[:20], DEPTH_SCALE_M))
+        nearer = [np.round(0.997 * frame).astype(np.uint16) for frame in frames[20:]]
+        moves.append(estimate_move(before, nearer, DEPTH_SCALE_M))
+    assert "nearer than when they were" in str(depths_words(moves))
