@@ -157,6 +157,14 @@ def test_a_tilted_floor_is_named(tmp_path: Path, tilt_deg: float) -> None:
         read_cloud(_written(tmp_path / "a.ply", points), "z")
 
 
+def test_a_level_plane_is_no_body(tmp_path: Path) -> None:
+    """It has no points below its lowest ones, where a floor was searched for."""
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(-2.0, 2.0, (3000, 2)), np.zeros(3000)])
+    with pytest.raises(InputError, match="is flat; a body has a front and a back"):
+        read_cloud(_written(tmp_path / "a.ply", points), "z")
+
+
 def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:
     points = _person(np.random.default_rng(4))
     assert len(read_cloud(_written(tmp_path / "a.ply", points), "z")) == len(points)

@@ -81,11 +81,12 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         raise InputError(
             f"{path} has points {extent_m:.4g} m apart; cut the person out, or name its --unit"
         )
+    _check_solid(np.asarray(cloud.points), path)
     person = standing_on(np.asarray(cloud.points))
     if person is not None:
         cloud = cloud.select_by_index(np.flatnonzero(person[0]))
     if not _has_unit_normals(cloud):
-        _estimate_normals(cloud, path)
+        _estimate_normals(cloud)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     middle = np.median(points, axis=0)
     if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
@@ -160,11 +161,14 @@ def _has_unit_normals(cloud: o3d.geometry.PointCloud) -> bool:
     return cloud.has_normals() and bool((np.abs(lengths - 1.0) < _UNIT).all())
 
 
-def _estimate_normals(cloud: o3d.geometry.PointCloud, path: Path) -> None:
-    """Give a cloud normals that point out of the body or into it."""
-    points = np.asarray(cloud.points)
+def _check_solid(points: Array, path: Path) -> None:
     if np.linalg.matrix_rank(points - points.mean(axis=0), _FLAT_M * np.sqrt(len(points))) < 3:
         raise InputError(f"{path} is flat; a body has a front and a back")
+
+
+def _estimate_normals(cloud: o3d.geometry.PointCloud) -> None:
+    """Give a cloud normals that point out of the body or into it."""
+    points = np.asarray(cloud.points)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     cloud.normals = o3d.utility.Vector3dVector(_outwards(points, np.asarray(cloud.normals)))
 

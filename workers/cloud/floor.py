@@ -153,6 +153,8 @@ def _check_tilted_floor(points: Array) -> None:
     """
     low, high = np.quantile(points[:, 2], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
     lowest = points[points[:, 2] < low + _LOWEST_SHARE * (high - low)]
+    if not len(lowest):
+        return
     draw = np.random.default_rng(len(points)).integers(len(lowest), size=(3, _PLANES))
     first, second, third = lowest[draw]
     normals = np.cross(second - first, third - first)
