@@ -64,6 +64,7 @@ def test_other_values_and_empty_lines_are_passed_over(tmp_path: Path, body: str)
         (_head("ascii", -5), "that cannot be"),
         (_head("ascii", fields=_FIELDS.replace("1 1 1 2", "1 1 1 -2")), "that cannot be"),
         (_head("ascii", fields=_FIELDS.replace("4 4 4 1", "3 4 4 1")), "unknown SIZE and TYPE"),
+        (_head("binary", fields=_FIELDS.replace("4 4 4 1", "4 8 4 1")) + 99 * "x", "of 8 bytes"),
         (_head("ascii", fields=_FIELDS.replace("4 4 4 1", "4 4 4")), "lacks one of SIZE"),
         (_head("ascii", fields=_FIELDS.replace("x y z", "x x z")), "have no x, y, z"),
         ("VERSION .7\n", "not a PCD file"),
@@ -77,6 +78,15 @@ def test_a_head_that_the_data_do_not_bear_out_is_refused(
     path.write_bytes(content.encode("latin1"))
     with pytest.raises(ValueError, match=words):
         check_pcd(path)
+
+
+def test_text_of_double_precision_is_read(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 1.7), (3000, 3))
+    rows = "".join(f"{x:.17g} {y:.17g} {z:.17g} 7 7\n" for x, y, z in points)
+    path = tmp_path / "a.pcd"
+    path.write_text(_head("ascii", 3000, _FIELDS.replace("4 4 4 1", "8 8 8 1")) + rows)
+    cloud = read_cloud(path, "z")
+    assert np.allclose(cloud.points + cloud.origin_m, points)
 
 
 def test_other_kinds_of_files_are_not_read(tmp_path: Path) -> None:

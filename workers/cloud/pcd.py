@@ -100,6 +100,9 @@ def _promised(head: dict[str, list[str]]) -> tuple[int, int, int]:
         raise ValueError("its head has numbers of points or values that cannot be")
     if any(size not in _KINDS.get(kind, ()) for kind, size in zip(kinds, sizes, strict=True)):
         raise ValueError("its head has values of an unknown SIZE and TYPE")
+    # Open3D takes them for 0.
+    if head["DATA"] != ["ascii"] and "8" in (sizes[fields.index(name)] for name in "xyz"):
+        raise ValueError("its x, y, z are numbers of 8 bytes; save them as 4 or as text")
     values = [int(count) for count in counts]
     row_bytes = sum(int(size) * count for size, count in zip(sizes, values, strict=True))
     return int(points[0]), sum(values), row_bytes
