@@ -88,13 +88,13 @@ def _moment(given: str) -> str:
         return ""
     try:
         moment = datetime.fromisoformat(given)
-    except ValueError:
+        if moment.tzinfo is not None:
+            moment = moment.astimezone(UTC)
+    except (ValueError, OverflowError):
         raise click.BadParameter(
             f"{given} is no day or time: write 2026-11-21, or 2026-11-21T10:00 (UTC)"
         ) from None
-    if moment.tzinfo is not None:
-        moment = moment.astimezone(UTC)
-    return moment.strftime("%Y-%m-%dT%H:%M:%S")
+    return moment.replace(tzinfo=None).isoformat(timespec="seconds")
 
 
 def _line(scan: ScanRecord) -> str:

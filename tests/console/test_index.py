@@ -197,6 +197,8 @@ def test_a_list_since_what_is_no_day_is_refused(spool: Spool) -> None:
         return CliRunner().invoke(station, ["list", "--since", since, *option]).output
 
     assert "gestern is no day or time: write 2026-11-21" in listed("gestern")
+    assert "is no day or time" in listed("0001-01-01T00:00+05:00")
+    assert listed("0999-01-01") == listed("")
     assert listed("2099-01-01") == "no scans since 2099-01-01T00:00:00\n"
     assert listed("20261123").count("\n") == listed("2026-11-23T00:00+00:00").count("\n") > 0
 
