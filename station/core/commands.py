@@ -35,7 +35,7 @@ class Number(click.FloatRange):
     """A number in a range. NaN lies in every range of click's own."""
 
     def __init__(
-        self, low: float | None = None, high: float | None = None, *, unit: str = "", **kwargs: bool
+        self, low: float, high: float | None = None, *, unit: str = "", **kwargs: bool
     ) -> None:
         super().__init__(low, high, **kwargs)
         self._unit = f" {unit}" if unit else ""
@@ -56,9 +56,10 @@ class Number(click.FloatRange):
             raise click.BadParameter(f"{value} is not {self._range()}.", ctx, param) from None
 
     def _range(self) -> str:
-        low = "" if self.min is None else f"{'above' if self.min_open else 'from'} {self.min:g}"
-        high = "or more" if self.max is None else f"up to {self.max:g}"
-        return f"{low} {high}{self._unit}"
+        low = f"{'above' if self.min_open else 'from'} {self.min:g}"
+        if self.max is None:
+            return f"{low}{self._unit}{'' if self.min_open else ' up'}"
+        return f"{low} up to {self.max:g}{self._unit}"
 
 
 class LazyGroup(click.Group):

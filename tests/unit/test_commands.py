@@ -53,6 +53,19 @@ def test_a_number_is_finite_and_in_its_range(given: str, words: str) -> None:
     assert CliRunner().invoke(command, ["--days", "1.5"]).output == "1.50\n"
 
 
+def test_a_number_without_an_end_says_so() -> None:
+    """The words were "from 0 or more metres"."""
+
+    @click.command()
+    @click.option("--height", type=Number(0.0, unit="metres"))
+    def command(height: float) -> None:
+        click.echo(f"{height:.2f}")
+
+    refused = CliRunner().invoke(command, ["--height", "-1"])
+    assert "-1 is not from 0 metres up." in refused.output
+    assert CliRunner().invoke(command, ["--height", "7e9"]).exit_code == 0
+
+
 @pytest.mark.parametrize("group", [station_cli.station, workers_cli.reconstruct])
 def test_help_lists_every_command_without_importing_it(
     group: LazyGroup, monkeypatch: pytest.MonkeyPatch
