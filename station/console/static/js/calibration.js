@@ -4,22 +4,13 @@ import { freshKey, get, post, remove } from './api.js';
 import { Cameras } from './cameras.js';
 import { ask, h, notice } from './dom.js';
 import { listen } from './events.js';
-import { said as sentence, t, time } from './i18n.js';
+import { t, time } from './i18n.js';
+import { STEPS, withButtons as said } from './remedies.js';
 import { settings } from './settings.js';
 
-const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
 const LOWEST_M = 0.3;
 const HIGHEST_M = 2.2;
 const LINES_SHOWN = 6;
-const COMMAND = new RegExp(`station calibrate(?: (--new|(?:${STEPS.join('|')})\\b))?(?: --[a-z]+)*`, 'g');
-
-// What the station says; the commands that it names are buttons here.
-function said(text) {
-  return sentence(text).replace(COMMAND, (_, word) => {
-    const key = word === '--new' ? 'new' : STEPS.includes(word) ? word : 'continue';
-    return t('cal.button', { name: t(`cal.${key}`) });
-  });
-}
 
 export async function calibration(main, session) {
   const booth = await get('/booth');
