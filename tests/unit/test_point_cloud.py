@@ -165,6 +165,15 @@ def test_a_level_plane_is_no_body(tmp_path: Path) -> None:
         read_cloud(_written(tmp_path / "a.ply", points), "z")
 
 
+def test_a_small_level_floor_is_not_tilted(tmp_path: Path) -> None:
+    """Noise spread it over several bands: "its floor is tilted by 0 degrees"."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        floor = np.column_stack([rng.uniform(-0.4, 0.4, (768, 2)), rng.normal(0.0, 8e-3, 768)])
+        points = np.concatenate([_person(rng), floor])
+        read_cloud(_written(tmp_path / "a.ply", points), "z")
+
+
 def test_a_person_without_a_floor_keeps_all_points(tmp_path: Path) -> None:
     points = _person(np.random.default_rng(4))
     assert len(read_cloud(_written(tmp_path / "a.ply", points), "z")) == len(points)

@@ -99,11 +99,7 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
         _check_tilted_floor(points)
         return None
     plane = np.array([0.0, 0.0, start_m + 0.5 * _BAND_M])
-    near = np.abs(points[:, 2] - plane[2]) < 2.0 * _BAND_M
-    for _ in range(_PLANE_ROUNDS):
-        basis = np.column_stack([points[near, :2], np.ones(int(near.sum()))])
-        plane = np.linalg.lstsq(basis, points[near, 2], rcond=None)[0]
-        near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _CLEARANCE_M
+    plane = _fitted(points, plane, 2.0 * _BAND_M)
     if np.linalg.norm(plane[:2]) > _LEVEL:
         raise _not_level(float(np.arctan(np.linalg.norm(plane[:2]))))
     above_m = points[:, 2] - points[:, :2] @ plane[:2] - plane[2]
@@ -133,6 +129,16 @@ def _under_feet_m(points: Array, above_m: Array, person: NDArray[np.intp]) -> fl
     return float(np.median(above_m[floor][near])) if near.sum() >= _FEWEST_NEAR else 0.0
 
 
+def _fitted(points: Array, plane: Array, within_m: float) -> Array:
+    """The plane z = plane @ (x, y, 1) through the points that lie near to a rough one."""
+    near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < within_m
+    for _ in range(_PLANE_ROUNDS):
+        basis = np.column_stack([points[near, :2], np.ones(int(near.sum()))])
+        plane = np.linalg.lstsq(basis, points[near, 2], rcond=None)[0]
+        near = np.abs(points[:, 2] - points[:, :2] @ plane[:2] - plane[2]) < _CLEARANCE_M
+    return plane
+
+
 def _floor_band(points: Array) -> float | None:
     """Lower end of the horizontal band that a floor fills."""
     low, high = np.quantile(points[:, 2], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
@@ -154,6 +160,7 @@ def _check_tilted_floor(points: Array) -> None:
     low, high = np.quantile(points[:, 2], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
     lowest = points[points[:, 2] < low + _LOWEST_SHARE * (high - low)]
     if not len(lowest):
+        # The cloud has hardly any height.
         return
     draw = np.random.default_rng(len(points)).integers(len(lowest), size=(3, _PLANES))
     first, second, third = lowest[draw]
@@ -171,8 +178,14 @@ def _check_tilted_floor(points: Array) -> None:
     area, above = (
         _covered_m2(points[np.abs(over_m - level_m) < _BAND_M]) for level_m in (0.0, _LEGS_M)
     )
-    if area > max(_FLOOR_M2, _FLOOR_OVER_LEGS * above):
-        raise _not_level(float(np.arccos(normals[best, 2])))
+    if area <= max(_FLOOR_M2, _FLOOR_OVER_LEGS * above):
+        return
+    slope = -normals[best, :2] / normals[best, 2]
+    rough = np.append(slope, first[best, 2] - slope @ first[best, :2])
+    slope = _fitted(points, rough, _CLEARANCE_M)[:2]
+    # Noise spreads a small level floor over several bands; it passes for none then.
+    if np.linalg.norm(slope) > _LEVEL:
+        raise _not_level(float(np.arctan(np.linalg.norm(slope))))
 
 
 def _not_level(tilt_rad: float) -> InputError:
