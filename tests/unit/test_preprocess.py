@@ -19,7 +19,7 @@ from station.core.rig import CameraCalibration, PredictedError
 from station.simulation.scene import Mesh, box, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.average import average
-from workers.cloud.observed import RAISED_FLOOR
+from workers.cloud.observed import LOWERED_FLOOR, RAISED_FLOOR
 from workers.cloud.one_person import cells_of
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
@@ -209,6 +209,22 @@ def test_a_mat_that_was_not_there_at_the_calibration_is_named(tmp_path: Path) ->
     assert "take mats away" in finding.message
     level = (scan.cloud.points[:, 2] < 0.015) & (scan.cloud.normals[:, 2] > 0.9)
     assert level.sum() < 30
+
+
+@pytest.mark.parametrize("lower_m", [0.01, 0.03])
+def test_a_calibration_that_is_too_low_is_named(bundle: Path, lower_m: float) -> None:
+    """Heights were too small by as much, to +-1.3 mm, with "ok"."""
+    read = read_bundle(bundle)
+    assert preprocess(read).findings == ()
+    drop = np.eye(4)
+    drop[2, 3] = -lower_m
+    cameras = {
+        name: replace(camera, world_from_camera=drop @ camera.world_from_camera)
+        for name, camera in read.rig.cameras.items()
+    }
+    (finding,) = preprocess(replace(read, rig=replace(read.rig, cameras=cameras))).findings
+    assert finding.code == LOWERED_FLOOR
+    assert finding.value == pytest.approx(-lower_m, abs=0.003)
 
 
 def test_nobody_in_the_volume_is_an_error(bundle: Path) -> None:

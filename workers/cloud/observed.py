@@ -22,7 +22,9 @@ RAISED_FLOOR = "floor-raised"
 """Code of the finding that a person stands on something: heights are not those above z = 0."""
 UNKNOWN_FLOOR = "floor-unknown"
 """Code of the finding that a bare cloud does not show where the floor is."""
-OFF_FLOOR = frozenset({RAISED_FLOOR, UNKNOWN_FLOOR})
+LOWERED_FLOOR = "floor-lowered"
+"""Code of the finding that a person stands below z = 0: cameras or their calibration are off."""
+OFF_FLOOR = frozenset({RAISED_FLOOR, LOWERED_FLOOR, UNKNOWN_FLOOR})
 """Codes after which nothing is measured that ends on the floor."""
 
 

@@ -17,7 +17,14 @@ from station.core.depth.images import Image, jumps
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m
-from workers.cloud.observed import RAISED_FLOOR, CameraView, Finding, PointCloud, Preprocessed
+from workers.cloud.observed import (
+    LOWERED_FLOOR,
+    RAISED_FLOOR,
+    CameraView,
+    Finding,
+    PointCloud,
+    Preprocessed,
+)
 from workers.cloud.one_person import cells_of, one_person
 from workers.cloud.points import normals, within
 
@@ -54,6 +61,12 @@ in 14 sound scans and 0.022 in the demo's, what noise lifts of an 8 mm mat above
 """
 _RAISED_NOISE_M = 0.006
 """Height above the middle of a mat's points up to which there are others."""
+_FLOOR_STRIDE, _FLOOR_BAND_M, _FLOOR_READINGS = 4, 0.06, 1000
+"""Every so many rows and columns are looked at for the floor, readings so near to z = 0 are it, and
+how many of them say where it is."""
+_LOWERED_FLOOR_M = -0.006
+"""Median height of the floor's readings below which it is not the calibrated one: 0.5 to 3.1 mm
+in 36 sound scans."""
 _SIGMA_FLOOR_M = 4e-4
 """Standard deviation that averaging more frames does not remove: quantisation, calibration."""
 
@@ -84,6 +97,8 @@ class _Camera:
     """Share of the readings in the volume that disagree between frames."""
     frames: int
     """Number of frames."""
+    floor_m: Array
+    """Heights of some of the readings near z = 0 in the volume."""
     ordered: int
     """Number of frames without the gaps in their sequence, at most `_PLENTY_OF_FRAMES`."""
 
@@ -105,6 +120,7 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         noticed = pool.map(partial(_camera_findings, expected), names, cameras, kept)
         views, clouds = zip(*cleaned, strict=True)
         findings += [finding for of_camera in noticed for finding in of_camera]
+    findings += _lowered_floor([camera.floor_m for camera in cameras])
     findings += [
         Finding("camera-blind", name, None, f"camera {name} sent no frame; check its cable")
         for name in bundle.rig.cameras
@@ -122,6 +138,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     averaged = average(bundle.depth_stack(name), bundle.depth_scale_m)
     depth = calibration.depth_correction.apply(averaged.depth_m).astype(np.float32)
     near = _in_volume(calibration, depth, volume)
+    floor_m = _floor_heights(calibration, depth, volume)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     restless = _in_volume(calibration, averaged.unsettled_m, volume)
     unsettled = float(restless.sum() / max(1, (near | restless).sum()))
@@ -130,7 +147,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         none = np.empty(0)
         return _Camera(
             calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
-            unsettled, len(bundle.frames[name]), _ordered(bundle, name),
+            unsettled, len(bundle.frames[name]), floor_m, _ordered(bundle, name),
         )  # fmt: skip
     # The rest works only on the part of the image that shows the person.
     border = _WINDOW_BORDER_PX
@@ -164,6 +181,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         change_m=averaged.change_m[window].ravel()[at].astype(np.float64),
         unsettled=unsettled,
         frames=len(bundle.frames[name]),
+        floor_m=floor_m,
         ordered=_ordered(bundle, name),
     )
 
@@ -194,6 +212,32 @@ def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -
     low[2] = max(low[2], volume.floor_clearance_m)
     pose = calibration.world_from_camera
     return within(rays(calibration), depth_m, pose, low, np.array(volume.max_m))
+
+
+def _floor_heights(calibration: CameraCalibration, depth_m: Image, volume: Volume) -> Array:
+    """Heights of some of the readings near the floor."""
+    some = np.s_[::_FLOOR_STRIDE, ::_FLOOR_STRIDE]
+    low, high = np.array(volume.min_m), np.array(volume.max_m)
+    low[2], high[2] = -_FLOOR_BAND_M, _FLOOR_BAND_M
+    directions, depths = rays(calibration)[some], depth_m[some]
+    pose = calibration.world_from_camera
+    points = (directions * depths[..., None])[depths > 0.0].astype(np.float64)
+    places = points @ pose[:3, :3].T + pose[:3, 3]
+    return np.asarray(places[((places > low) & (places < high)).all(axis=1), 2])
+
+
+def _lowered_floor(heights_m: Sequence[Array]) -> list[Finding]:
+    """The finding that the floor lies lower than the calibrated one, where it does."""
+    readings_m = np.concatenate(heights_m)
+    if len(readings_m) < _FLOOR_READINGS:
+        return []
+    level_m = float(np.median(readings_m))
+    if level_m > _LOWERED_FLOOR_M:
+        return []
+    message = (
+        f"the floor lies {-1e3 * level_m:.0f} mm lower than at the calibration; run: station check"
+    )
+    return [Finding(LOWERED_FLOOR, None, level_m, message)]
 
 
 def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
