@@ -160,7 +160,7 @@ STATIC = ROOT / "station/console/static"
 
 
 def _on_the_page(tmp_path: Path, module: str, function: str, texts: list[str], to: str) -> Any:
-    """What a function of the page's own scripts, run as they stand, makes of texts."""
+    """Results of a function of the page's own scripts, run as they stand."""
     script = tmp_path / "said.mjs"
     words, said = ((STATIC / "js" / name).as_uri() for name in ("i18n.js", module))
     script.write_text(
