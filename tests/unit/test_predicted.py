@@ -109,14 +109,20 @@ def test_a_job_tells_the_measurements(
     monkeypatch.setattr(job, "measure_standing", measure)
     for skin in ("patch_sigma_m", "hidden_head_sigma"):
         monkeypatch.setattr(job, skin, lambda *_: np.zeros(3))
+    monkeypatch.setattr(job, "floor_sigma_m", lambda cloud: cloud.floor_sigma_m)
     surface = SimpleNamespace(sigma_m=np.zeros(3), seen=np.ones(3, bool))
     patches = Future[tuple[Patch, ...]]()
     patches.set_result(())
     fit = SimpleNamespace(
-        surface=surface, crown_sigma_m=3e-3, patches=patches, vertices=np.zeros((3, 3)), state=None
+        surface=surface,
+        crown_sigma_m=3e-3,
+        patches=patches,
+        vertices=np.zeros((3, 3)),
+        state=None,
+        cloud=SimpleNamespace(floor_sigma_m=5e-4),
     )
     with ThreadPoolExecutor(1) as beside:
         job._measuring(beside, cast(Any, None), cast(Any, fit), predicted, Stopwatch())
-    sizes = (0.0, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
+    sizes = (5e-4, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
     assert [(one.height_sigma_m, one.girth_sigma_m) for one in told] == [sizes, sizes]
     assert {one.crown_sigma_m for one in told} == {3e-3}
