@@ -31,6 +31,7 @@ SPEAKERS = (
     "station/calibration/guide/raised_ball.py",
     "station/calibration/guide/steps.py",
     "station/calibration/guide/feed.py", "station/calibration/guide/recorded_clock.py",
+    "station/calibration/guide/recordings.py",
     "station/calibration/guide/session.py",
     "station/calibration/guide/seen.py",
     "station/calibration/guide/store.py", "station/calibration/solve/refusals.py",

@@ -12,6 +12,7 @@ from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.step_names import EMPTY
 from station.calibration.guide.feed import Feed, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
+from station.calibration.guide.recordings import step_folder
 from station.calibration.guide.session import SESSION, Session
 from station.calibration.guide.steps import rest_ball
 from station.calibration.guide.store import CalibrationStore
@@ -63,6 +64,17 @@ class Attempt:
             return Session.load(self.store.folder / used)
         return session
 
+    def following(self, solving: str) -> str:
+        """Words on what comes after a step by itself; ``solving``: where that is the solution."""
+        session = self.unfinished_session()
+        # The empty booth begins another calibration where none is being done.
+        following = (
+            solving
+            if session is not None and session.balls
+            else "station calibrate goes through the steps that are missing"
+        )
+        return f"kept, and not in use yet: {following}"
+
     def see_at_rest(self, step: str) -> tuple[Session, list[BallDetection]]:
         """The ball where it was put in a step, and the calibration that it is seen in."""
         with self.feed(step) as (feed, session):
@@ -92,15 +104,7 @@ class Attempt:
     def _source(self, step: str) -> AbstractContextManager[Feed]:
         if self.recordings is None:
             return live_feed(self.config)
-        if (self.recordings / step).is_dir():
-            return replayed_feed(self.config, self.recordings / step)
-        inside = sorted(self.recordings.iterdir())
-        known = ", ".join(path.name for path in inside) or "nothing"
-        deeper = [path for path in inside if (path / step).is_dir()]
-        hint = f" ({deeper[0]} does)" if deeper else ""
-        raise CalibrationError(
-            f"{self.recordings} holds no recording of the step {step}; it holds {known}{hint}"
-        )
+        return replayed_feed(self.config, step_folder(self.recordings, step))
 
     def _joined(self, step: str, cameras: Mapping[str, CameraCalibration]) -> Session:
         """The calibration that a step of these cameras goes into."""

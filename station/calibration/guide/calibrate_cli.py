@@ -95,14 +95,8 @@ def _step(command: Callable[..., None]) -> Callable[..., Any]:
     @functools.wraps(command)
     def wrapped(procedure: Procedure, **kwargs: Any) -> None:
         command(procedure, **kwargs)
-        session = procedure.unfinished_session()
-        # The empty booth begins another calibration where none is being done.
-        following = (
-            "station calibrate solve puts it into use"
-            if session is not None and session.balls
-            else "station calibrate goes through the steps that are missing"
-        )
-        click.echo(f"  kept, and not in use yet: {following}")
+        following = procedure.following("station calibrate solve puts it into use")
+        click.echo(f"  {following}")
 
     return wrapped
 
@@ -253,13 +247,9 @@ def stand(procedure: Procedure, height_m: float | None, hanging: bool) -> None:
       station calibrate stand --height 0.7 --hanging
     """
     from station.calibration.guide.raised_ball import see_all_heights, see_height
-    from station.calibration.guide.recordings import check_height
 
     if height_m is not None:
-        kind = HANGING if hanging else STAND
-        if procedure.recordings is not None:
-            check_height(procedure.recordings, kind, height_m)
-        see_height(procedure, height_m, kind)
+        see_height(procedure, height_m, HANGING if hanging else STAND)
     elif procedure.guide.attended or procedure.recordings is not None:
         see_all_heights(procedure, again=True, kind=HANGING if hanging else None)
     else:

@@ -1,10 +1,17 @@
-"""Folders of recordings that a technician takes for others."""
+"""Folders of recordings, and those that a technician takes for others."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from station.calibration.detect.step_names import EMPTY, HANGING, STAND, raised_step
+from station.calibration.detect.step_names import (
+    EMPTY,
+    HANGING,
+    STAND,
+    kind_of,
+    raised_height_m,
+    raised_step,
+)
 from station.core.errors import CalibrationError
 
 
@@ -16,27 +23,33 @@ def check_folder(recordings: Path) -> None:
     """
     if (recordings / EMPTY).is_dir():
         return
-    meant = sorted(path for path in recordings.iterdir() if (path / EMPTY).is_dir())
-    if meant:
+    if meant := _folders_with(recordings, EMPTY):
         raise CalibrationError(
             f"{recordings} holds no recordings of a calibration, but {meant[0]} does: "
             f"--recordings {meant[0]}"
         )
 
 
-def check_height(recordings: Path, kind: str, height_m: float) -> None:
-    """Refuse a height of the ball on a stand that was recorded as one of the hanging ball, or the
-    other way round.
+def step_folder(recordings: Path, step: str) -> Path:
+    """The folder of a step's recordings, one in it for each camera.
 
     Raises:
-        CalibrationError: naming the option that helps.
+        CalibrationError: there is none; naming the folder or the option that helps.
     """
-    other = HANGING if kind == STAND else STAND
-    step = raised_step(other, height_m)
-    if (recordings / raised_step(kind, height_m)).is_dir() or not (recordings / step).is_dir():
-        return
-    remedy = "add --hanging" if other == HANGING else "leave --hanging out"
-    raise CalibrationError(
-        f"{recordings} holds no recording of the step {raised_step(kind, height_m)}, but {step}: "
-        f"{remedy}"
-    )
+    folder = recordings / step
+    if folder.is_dir():
+        return folder
+    missing = f"{recordings} holds no recording of the step {step}"
+    if height_m := raised_height_m(step):
+        other = raised_step(STAND if kind_of(step) == HANGING else HANGING, height_m)
+        remedy = "leave --hanging out" if kind_of(step) == HANGING else "add --hanging"
+        if (recordings / other).is_dir():
+            raise CalibrationError(f"{missing}, but {other}: {remedy}")
+    known = ", ".join(sorted(path.name for path in recordings.iterdir())) or "nothing"
+    deeper = _folders_with(recordings, step)
+    hint = f" ({deeper[0]} does)" if deeper else ""
+    raise CalibrationError(f"{missing}; it holds {known}{hint}")
+
+
+def _folders_with(recordings: Path, step: str) -> list[Path]:
+    return sorted(path for path in recordings.iterdir() if (path / step).is_dir())

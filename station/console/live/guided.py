@@ -112,13 +112,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
             case "solve":
                 procedure.solve()
     if step not in ("all", "solve"):
-        session = procedure.unfinished_session()
-        following = (
-            "the computation puts it into use"
-            if session is not None and session.balls
-            else "station calibrate goes through the steps that are missing"
-        )
-        guide.say(f"kept, and not in use yet: {following}")
+        guide.say(procedure.following("the computation puts it into use"))
 
 
 def main() -> int:
