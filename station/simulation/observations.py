@@ -11,7 +11,16 @@ from station.calibration.detect.ball import find_ball
 from station.calibration.detect.detections import BallDetection, Observations, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import static_view
-from station.calibration.detect.step_names import BALL, EMPTY, FRONT, HANGING, MARK, PLACES
+from station.calibration.detect.step_names import (
+    BALL,
+    EMPTY,
+    FRONT,
+    HANGING,
+    MARK,
+    PLACES,
+    WALL,
+    kind_of,
+)
 from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration
@@ -63,7 +72,7 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
     planes: list[PlaneObservation | None] = [observe_floor(empty, DEPTH_SCALE_M, camera)]
     waved, mark, front = balls(BALL, None), balls(MARK, _LOOK_S), balls(FRONT, _LOOK_S)
     for step in procedure.steps:
-        if step.startswith("wall-"):
+        if kind_of(step) == WALL:
             planes.append(
                 observe_wall(still(step, _LOOK_S), DEPTH_SCALE_M, camera, step, background)
             )

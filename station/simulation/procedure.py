@@ -21,8 +21,11 @@ from station.calibration.detect.step_names import (
     PLACES,
     STAND,
     WALL,
+    kind_of,
     numbered_step,
+    place_of,
     raised_height_m,
+    raised_step,
 )
 from station.core.errors import InputError
 from station.core.kinect_v1 import INDEPENDENT_HZ
@@ -81,7 +84,7 @@ class VirtualProcedure:
         walls = (numbered_step(WALL, i) for i in range(len(self.board_at_m)))
         around = (numbered_step(AROUND, i) for i in range(len(self.around_m)))
         kind = HANGING if self.hanging else STAND
-        raised = (f"{kind}-{round(1e3 * height)}" for height in self.raised_m)
+        raised = (raised_step(kind, height) for height in self.raised_m)
         return (EMPTY, BALL, MARK, FRONT, *walls, *around, *raised)
 
     def starts_s(self, step: str) -> float:
@@ -135,9 +138,7 @@ class VirtualProcedure:
         return _HANG_S if step.startswith(HANGING) else _REST_S
 
     def _board_y_m(self, step: str) -> float | None:
-        return (
-            self.board_at_m[int(step.removeprefix("wall-"))] if step.startswith("wall-") else None
-        )
+        return self.board_at_m[place_of(step)] if kind_of(step) == WALL else None
 
     def _still(self, camera: str, board_y_m: float | None) -> TrueView:
         """The view of everything fixed; most steps share it."""
@@ -173,8 +174,8 @@ class VirtualProcedure:
         x, y, height = 0.0, 0.0, 0.0
         if step == FRONT:
             y = -self.front_m
-        elif step.startswith(AROUND):
-            x, y = self.around_m[int(step.removeprefix(f"{AROUND}-"))]
+        elif kind_of(step) == AROUND:
+            x, y = self.around_m[place_of(step)]
         elif (stated_m := raised_height_m(step)) is not None:
             stated_mm = round(1e3 * stated_m)
             rng = np.random.default_rng((self.booth.seed, 11, stated_mm))
@@ -185,7 +186,7 @@ class VirtualProcedure:
         return np.array([x, y, height + float(bow) + self.true_radius_m])
 
     def _moving(self, step: str, time_s: float) -> list[Capsule]:
-        if step == EMPTY or step.startswith("wall-"):
+        if kind_of(step) in (EMPTY, WALL):
             return []
         radius_m, switches = self.true_radius_m, self.booth.violations
         waved = step == BALL

@@ -25,6 +25,11 @@ def kind_of(step: str) -> str:
     return step.partition(_JOINT)[0]
 
 
+def place_of(step: str) -> int:
+    """Number of the place in the name of a step of several (AROUND, WALL)."""
+    return int(step.partition(_JOINT)[2])
+
+
 def numbered_step(kind: str, place: int) -> str:
     """Name of the step at one of several places (AROUND, WALL), from 0."""
     return f"{kind}{_JOINT}{place}"

@@ -134,12 +134,12 @@ class Seen:
     @property
     def around_count(self) -> int:
         """Places on the floor around the mark at which the ball was seen."""
-        return sum(place.startswith(AROUND) for place in self.around)
+        return sum(kind_of(place) == AROUND for place in self.around)
 
     @property
     def raised(self) -> list[str]:
         """Steps in which the ball was seen at a measured height."""
-        return [place for place in self.around if place.startswith(RAISED)]
+        return [place for place in self.around if kind_of(place) in RAISED]
 
     def raised_as(self, kind: str) -> dict[str, float]:
         """Steps in which the ball was on a stand, or hung (STAND, HANGING), and their heights."""
@@ -147,7 +147,7 @@ class Seen:
         return {
             place: height_m
             for place, height_m in heights_m.items()
-            if height_m is not None and place.startswith(kind)
+            if height_m is not None and kind_of(place) == kind
         }
 
     @property
