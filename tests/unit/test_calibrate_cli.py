@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from seen_balls import CAMERAS, ball
 
 from station.calibration.detect.board import Board
-from station.calibration.detect.detections import BallDetection
 from station.calibration.guide import raised_ball
 from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.calibrate_cli import calibrate
@@ -25,8 +25,6 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.errors import BoothError, CalibrationError
 from station.core.rig import Rig
 from station.simulation.scene import default_rig
-
-CAMERAS = default_rig().cameras
 
 
 @pytest.fixture
@@ -130,11 +128,7 @@ def test_a_step_says_what_comes_next(
 ) -> None:
     """After the empty booth, which begins another calibration, solve was named, and refused."""
     session = _begin(store)
-    session.balls += balls * [
-        BallDetection(
-            next(iter(CAMERAS)), 0.0, np.zeros(3), np.eye(3), 900, 0.1, 1e-3, np.ones((5, 4))
-        )
-    ]
+    session.balls += balls * [ball(next(iter(CAMERAS)), 0.0)]
     monkeypatch.setattr(Procedure, "empty", lambda _: None)
     monkeypatch.setattr(Procedure, "unfinished_session", lambda _: session)
     done = _run(config, "floor")
