@@ -34,10 +34,11 @@ _TERMS = 6
 """Coefficients of a patch."""
 
 
-def lowest_m(points: Array) -> float:
-    """Height of the lowest of a cloud's points (n, 3) that lie on skin."""
+def lowest_m(tree: cKDTree) -> float:
+    """Height of the lowest of a cloud's points, those of a tree, that lie on skin."""
+    points = tree.data
     low = np.argsort(points[:, 2], kind="stable")[:_LOWEST]
-    away_m, around = cKDTree(points).query(points[low], _PATCH + 1, workers=-1)
+    away_m, around = tree.query(points[low], _PATCH + 1, workers=-1)
     rms, off, beside = _patches(points[around[:, 1:]], points[low])
     near_m = away_m[:, _NEIGHBOUR]
     stray = near_m > max(_FAR_RATIO * float(np.median(near_m)), _FAR_M)
@@ -45,10 +46,11 @@ def lowest_m(points: Array) -> float:
     return float(points[low[0 if stray.all() else int(np.argmin(stray))], 2])
 
 
-def scatter_m(points: Array) -> float:
-    """Standard deviation of a cloud's points (n, 3) about the skin."""
+def scatter_m(tree: cKDTree) -> float:
+    """Standard deviation of a cloud's points, those of a tree, about the skin."""
+    points = tree.data
     chosen = points[:: max(1, len(points) // _PATCHES)]
-    around = cKDTree(points).query(chosen, _PATCH, workers=-1)[1]
+    around = tree.query(chosen, _PATCH, workers=-1)[1]
     return float(np.quantile(_patches(points[around], chosen)[0], _SMOOTH_SHARE))
 
 

@@ -59,8 +59,8 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     """Read a cloud and move its middle to the mark and its lowest points, or its floor, to z = 0.
 
     A floor that was scanned too is taken away, and what stands apart on it. Single points below
-    the soles are not taken for these. A cloud whose lowest
-    points are slightly above z = 0, as where no camera saw the soles, keeps its heights.
+    the soles are not taken for these. A cloud whose lowest points are slightly above z = 0, as
+    where no camera saw the soles, keeps its heights.
     `origin_m` of the cloud is the new origin in the file's frame, in metres, after `up`. The same
     file gives the same points.
 
@@ -88,11 +88,12 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     if not _has_unit_normals(cloud):
         _estimate_normals(cloud)
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    tree = cKDTree(points)
     middle = np.median(points, axis=0)
     if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
         normals = -normals
     if person is None:
-        low_m = lowest_m(points)
+        low_m = lowest_m(tree)
         middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
     else:
         middle[2] = person[1]
@@ -104,7 +105,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         camera=np.zeros(len(points), np.int16),
         camera_names=("cloud",),
         origin_m=(x, y, z),
-        scatter_m=scatter_m(points),
+        scatter_m=scatter_m(tree),
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from station.core.bundle import Bundle
 from station.core.config import Volume
 from station.core.depth.images import Image, jumps
+from station.core.geometry import transform
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m
@@ -220,9 +221,8 @@ def _floor_heights(calibration: CameraCalibration, depth_m: Image, volume: Volum
     low, high = np.array(volume.min_m), np.array(volume.max_m)
     low[2], high[2] = -_FLOOR_BAND_M, _FLOOR_BAND_M
     directions, depths = rays(calibration)[some], depth_m[some]
-    pose = calibration.world_from_camera
-    points = (directions * depths[..., None])[depths > 0.0].astype(np.float64)
-    places = points @ pose[:3, :3].T + pose[:3, 3]
+    points = (directions * depths[..., None])[depths > 0.0]
+    places = transform(calibration.world_from_camera, points)
     return np.asarray(places[((places > low) & (places < high)).all(axis=1), 2])
 
 

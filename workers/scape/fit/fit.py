@@ -241,10 +241,10 @@ def separate_limbs(
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
     noticed = [*findings, *leaning(model, rotations)]
-    if fit.reference is not None and not fit.camera_shifts_m:
-        noticed += off_floor(model, fit.reference)
     misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
     if not fit.camera_shifts_m:
+        if fit.reference is not None:
+            noticed += off_floor(model, fit.reference)
         misplaced |= feet_cut_off(model, vertices, fit.cloud.points)
         misplaced |= head_cut_off(model, surface.seen, fit.crown_sigma_m)
     lost = lost_parts(model, fit.patches.result())
