@@ -9,13 +9,14 @@ import errno
 import importlib
 import math
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
-from station.core.errors import BoothError
+from station.core.errors import BoothError, InputError
 from station.core.service import set_up_caches
 
 config_option = click.option(
@@ -29,6 +30,7 @@ _OPTIONAL = {
 }
 """A library that may be missing -> the remedy."""
 _NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
+_NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
 
 class Number(click.FloatRange):
@@ -89,6 +91,22 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in self._lazy.items()])
 
 
+def writable_folder(folder: Path, option: str, mode: int = 0o777) -> None:
+    """Make the folder that an option names, before any work is done for it.
+
+    Raises:
+        InputError: nothing can be written there; the message names the option.
+    """
+    try:
+        folder.mkdir(mode, parents=True, exist_ok=True)
+        # Root may write everywhere, by its rights, and still makes no file in /proc.
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as cause:
+        raise InputError(
+            f"{folder} cannot be written ({cause.strerror}); name another folder with {option}"
+        ) from None
+
+
 def run(group: click.Group) -> None:
     """Call a command; an error that the user can act upon becomes one line and exit code 1."""
     set_up_caches()
@@ -98,7 +116,7 @@ def run(group: click.Group) -> None:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
     except OSError as error:
-        if error.filename and error.errno in _NO_ACCESS:
+        if error.filename and error.errno in (*_NO_ACCESS, *_NO_PLACE):
             click.echo(
                 f"error: {error.filename} cannot be used ({error.strerror}); check its name, and "
                 "that this user may read and write there",

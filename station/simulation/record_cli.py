@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from station.calibration.detect.step_names import EMPTY
-from station.core.commands import Number
+from station.core.commands import Number, writable_folder
 from station.core.errors import InputError
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import STRIDE, VirtualProcedure
@@ -99,6 +99,7 @@ def record_virtual(
     """
     if hanging and waving_s is None:
         raise InputError("--hanging is of a calibration: give --calibration SECONDS too")
+    writable_folder(out_folder, "--out")
     bias_m = 0.0 if waving_s is None else _UNIT_BIAS_M
     booth = SimulatedBooth(seed=seed, bias_m=bias_m, clutter=fixed_posts())
     jobs: dict[str, Callable[[], int]] = {

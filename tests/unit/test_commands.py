@@ -9,6 +9,8 @@ from click.testing import CliRunner
 
 from station import cli as station_cli
 from station.core.commands import LazyGroup, Number, run
+from station.core.errors import InputError
+from station.core.files import private_folder
 from workers import cli as workers_cli
 
 _ALL = [
@@ -95,19 +97,44 @@ def test_a_full_disk_is_one_line(
     assert told.count("\n") == 1
 
 
-def test_a_place_without_access_is_one_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [("/" + 300 * "a", "File name too long"), ("/proc/x", "No such file or directory")],
+)
+def test_a_place_that_cannot_be_used_is_one_line(
+    place: str, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    @click.group(invoke_without_command=True)
-    def look() -> None:
-        Path("/" + 300 * "a").stat()
+    """A folder of booth.toml that cannot be made ended every command with a traceback."""
 
-    monkeypatch.setattr(sys, "argv", ["look"])
+    @click.group(invoke_without_command=True)
+    def make() -> None:
+        private_folder(Path(place))
+
+    monkeypatch.setattr(sys, "argv", ["make"])
     with pytest.raises(SystemExit, match="1"):
-        run(look)
+        run(make)
     told = capsys.readouterr().err
-    assert "cannot be used (File name too long); check its name" in told
+    assert f"{place} cannot be used ({words}); check its name" in told
     assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("group", "words"),
+    [
+        (station_cli.station, ["record-virtual", "--out", "/proc/x"]),
+        (workers_cli.reconstruct, ["train", "--out", "/proc/x/body.npz"]),
+        (workers_cli.reconstruct, ["evaluate-model", "--pictures", "/proc/x"]),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(
+    group: click.Group, words: list[str]
+) -> None:
+    """A model was learned for minutes before its file could not be made."""
+    done = CliRunner().invoke(group, words)
+    assert isinstance(done.exception, InputError)
+    assert "/proc/x cannot be written (No such file or directory); name another folder with " in (
+        str(done.exception)
+    )
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:

@@ -70,11 +70,13 @@ def test_folders_that_cannot_be_made_are_refused_before_the_work(tmp_path: Path)
     (tmp_path / "nowhere").symlink_to("nothing")
     (tmp_path / "loop").symlink_to("loop")
     places = (
-        ("--out", "file/result", "cannot be made"),
+        ("--out", "file/result", "cannot be written"),
         ("--out", "nowhere", "exists already"),
-        ("--out", "loop/result", "cannot be made"),
-        ("--debug", "file", "cannot be made"),
-        ("--debug", "loop/pictures", "cannot be made"),
+        ("--out", "loop/result", "cannot be written"),
+        # Root may write there, but nothing can be made.
+        ("--out", "/proc/result", "cannot be written"),
+        ("--debug", "file", "cannot be written"),
+        ("--debug", "loop/pictures", "cannot be written"),
     )
     for option, place, words in places:
         options = {"--out": tmp_path / "out", option: tmp_path / place}

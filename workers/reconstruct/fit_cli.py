@@ -10,6 +10,7 @@ from typing import get_args
 
 import click
 
+from station.core.commands import writable_folder
 from station.core.errors import InputError
 from station.core.files import PRIVATE_FOLDER_MODE, publish_folder
 from workers.scape.fit.fit import Method
@@ -134,16 +135,7 @@ def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:
     # A link that leads nowhere does not exist, but a folder cannot take its name.
     if os.path.lexists(out_folder):
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
-    for folder, option in ((out_folder.parent, "--out"), (debug_folder, "--debug")):
-        if folder is None:
-            continue
+    writable_folder(out_folder.parent, "--out")
+    if debug_folder is not None:
         # Pictures of a body are as private as its scan.
-        mode = PRIVATE_FOLDER_MODE if option == "--debug" else 0o777
-        try:
-            folder.mkdir(mode, parents=True, exist_ok=True)
-        except OSError as cause:
-            raise InputError(
-                f"{folder} cannot be made ({cause.strerror}); name another folder with {option}"
-            ) from None
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise InputError(f"{folder} cannot be written; name another folder with {option}")
+        writable_folder(debug_folder, "--debug", PRIVATE_FOLDER_MODE)

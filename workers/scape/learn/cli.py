@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from station.core.commands import writable_folder
+
 _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
 
 
@@ -37,6 +39,7 @@ def train(out: Path, seed: int, bodies: int, poses: int, components: int) -> Non
       reconstruct train --out workers/scape/model/data/body.npz
       reconstruct train --out small.npz --bodies 300 --poses 100 --components 40
     """
+    writable_folder(out.parent, "--out")
     from workers.scape.learn.train import TrainingPlan
     from workers.scape.learn.train import train as learn
 
@@ -76,6 +79,8 @@ def evaluate_model(
       reconstruct evaluate-model --model small.npz --bodies 20
       reconstruct evaluate-model --pictures pictures --other-bodies scans
     """
+    if pictures is not None:
+        writable_folder(pictures, "--pictures")
     from workers.scape.learn.evaluate import Evaluation, evaluate
 
     for line in evaluate(Evaluation(model, bodies, seed, pictures, other_bodies)):
