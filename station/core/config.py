@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, SerializeAsAny, model_validator
 
@@ -23,7 +23,11 @@ def _found_afar(radius_m: float) -> float:
     return radius_m
 
 
-Metres3 = tuple[float, float, float]
+_AS_A_LIST = Field(strict=False)
+"""TOML writes a tuple as a list."""
+_Value = TypeVar("_Value")
+Several = Annotated[tuple[_Value, ...], _AS_A_LIST]
+Metres3 = Annotated[tuple[float, float, float], _AS_A_LIST]
 
 
 class Volume(Strict):
@@ -72,7 +76,7 @@ class CalibrateConfig(Strict):
     reference: str = Field(
         default="", description="the camera whose frame the others are solved in first"
     )
-    front: tuple[str, ...] = Field(
+    front: Several[str] = Field(
         default=(), description="the cameras that face the person; default: named front..."
     )
     waving_s: float = Field(
@@ -139,7 +143,7 @@ class ConsoleConfig(Strict):
     enabled: bool = Field(default=True, description="whether the station runs a console")
     host: str = Field(default="127.0.0.1", description="address to listen at; 0.0.0.0 for all")
     port: int = Field(default=8420, ge=1, le=65535)
-    names: tuple[str, ...] = Field(
+    names: Several[str] = Field(
         default=(), description="names by which browsers reach it, besides the host's own"
     )
     folder: ConfigPath = Field(default=Path("console"), description="password, tokens, log")
@@ -209,7 +213,7 @@ class BoothConfig(Strict):
 
     version: Literal[1] = 1
     name: str = Field(default="", max_length=60, description="the booth's name, in every result")
-    cameras: tuple[SerializeAsAny[CameraConfig], ...] = Field(min_length=1)
+    cameras: Several[SerializeAsAny[CameraConfig]] = Field(min_length=1)
     calibration: ConfigPath = Path("calibration.json")
     volume: Volume = _section()
     sync: SyncConfig = _section()
@@ -221,7 +225,7 @@ class BoothConfig(Strict):
     retention: RetentionConfig = _section()
     runtime: RuntimeConfig = _section()
     console: ConsoleConfig = _section()
-    deliver: tuple[DeliverConfig, ...] = ()
+    deliver: Several[DeliverConfig] = ()
     metrics: MetricsConfig = _section()
 
     @model_validator(mode="after")

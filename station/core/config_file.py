@@ -5,7 +5,9 @@ Relative paths are relative to the folder of the configuration file.
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +20,20 @@ from station.core.errors import ConfigError
 
 DEFAULT_PATH = Path("booth.toml")
 ENVIRONMENT_VARIABLE = "BOOTH_CONFIG"
+_DECIMAL_COMMA = re.compile(r"^ *\w+ *= *[+-]?\d+,\d+", re.MULTILINE)
+_MUST = {
+    "bool_type": "must be true or false, without quotes",
+    "float_type": "must be a number, without quotes",
+    "int_type": "must be a whole number, without quotes",
+    "model_type": "must be a section with keys of its own",
+    "path_type": "must be a path in quotes",
+    "string_type": "must be a text in quotes",
+    "string_too_long": "must have at most {max_length} characters",
+    "too_long": "must have at most {max_length} values",
+    "too_short": "must have at least {min_length}",
+    "tuple_type": "must be a list in brackets",
+}
+"""Kind of pydantic's error -> words that need no Python; those of the others do not."""
 
 
 def find_config(path: Path | None) -> Path:
@@ -33,8 +49,24 @@ def load_config(path: Path) -> BoothConfig:
     Raises:
         ConfigError: naming the file, the key and what is allowed.
     """
+    document = _document(path)
+    base = {BASE_FOLDER: path.resolve().parent}
     try:
-        document = tomllib.loads(path.read_text())
+        if isinstance(cameras := document.get("cameras"), list):
+            document["cameras"] = [
+                _camera(section, index, base) for index, section in enumerate(cameras)
+            ]
+        return _validated(BoothConfig, document, (), base)
+    except ConfigError as cause:
+        raise ConfigError(f"{path}: {cause}") from None
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """The keys and values of a TOML file; Windows' editors put a mark before its first letter."""
+    text = ""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        return tomllib.loads(text)
     except PermissionError:
         # Under sudo, an installed booth's commands run as its user.
         raise ConfigError(
@@ -46,22 +78,25 @@ def load_config(path: Path) -> BoothConfig:
             f"{path} cannot be read ({cause.strerror}); station setup writes it, --config names "
             "another file"
         ) from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is not text in UTF-8; save it as UTF-8") from None
     except (ValueError, RecursionError) as cause:
-        # Python's own words for the others are advice to programmers.
-        its_own = isinstance(cause, tomllib.TOMLDecodeError | UnicodeDecodeError)
-        said = cause if its_own else "a number or brackets in brackets go on for too long"
         raise ConfigError(
-            f"{path} is not TOML: {said}; correct it, or station setup --replace writes a new one"
+            f"{path} is not TOML: {_no_toml(cause, text)}; correct it, or station setup --replace "
+            "writes a new one"
         ) from None
-    base = {BASE_FOLDER: path.resolve().parent}
-    try:
-        if isinstance(cameras := document.get("cameras"), list):
-            document["cameras"] = [
-                _camera(section, index, base) for index, section in enumerate(cameras)
-            ]
-        return _validated(BoothConfig, document, (), base)
-    except ConfigError as cause:
-        raise ConfigError(f"{path}: {cause}") from None
+
+
+def _no_toml(cause: Exception, text: str) -> str:
+    """Words for what the parser found; Python's own are advice to programmers."""
+    if isinstance(cause, RecursionError):
+        return "it has brackets in brackets in brackets, on and on"
+    if not isinstance(cause, tomllib.TOMLDecodeError):
+        return "it has a number of thousands of digits"
+    # A section's name is told as a Python tuple.
+    said = re.sub(r"\('([^()]*)',?\)", lambda found: found[1].replace("', '", "."), str(cause))
+    comma = _DECIMAL_COMMA.search(text)
+    return said + (f" ({comma[0].strip()}: write a point, 1.8)" if comma else "")
 
 
 Section = TypeVar("Section", bound=Strict)
@@ -87,7 +122,7 @@ def _validated(model: type[Section], document: Any, place: _Place, base: Any) ->
 
 
 def _key(place: _Place) -> str:
-    return ".".join(str(part) for part in place) or "the file"
+    return ".".join(map(str, place))
 
 
 def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -> str:
@@ -100,7 +135,16 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
             at = at.__args__[0] if isinstance(part, int) else at.model_fields[part].annotation
         return f"unknown key {key}; allowed here: {', '.join(at.model_fields)}"
     if problem["type"] == "missing":
-        return f"{key} is missing"
-    said = problem["msg"].removeprefix("Value error, ").replace("Tuple should", "Input should")
-    said = said.replace("Input should", "must").replace("valid tuple", "list")
-    return f"{key}: {said} (found {problem['input']!r:.80})"
+        return f"{key} is missing; add it"
+    if problem["type"] == "tuple_type" and isinstance(problem["input"], dict):
+        return f"{key}: there can be several; write [[{key}]]"
+    said = _MUST.get(problem["type"], problem["msg"]).format(**problem.get("ctx", {}))
+    said = said.removeprefix("Value error, ").replace("Input should", "must")
+    # The key says already which section is meant.
+    found = "" if isinstance(problem["input"], dict | Strict) else _found(problem["input"])
+    return f"{key}: {said}{found}" if key else f"{said}{found}"
+
+
+def _found(value: Any) -> str:
+    """A value as TOML has it, cut to a readable length."""
+    return f" (found {json.dumps(value, default=str, ensure_ascii=False):.80})"

@@ -46,15 +46,18 @@ def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
 
 
 Name = Annotated[str, AfterValidator(plain_name)]
-ConfigPath = Annotated[Path, AfterValidator(_beside_the_file)]
+ConfigPath = Annotated[Path, Field(strict=False), AfterValidator(_beside_the_file)]
 """A path in the configuration: a relative one is relative to the configuration file."""
 
 
 class Strict(BaseModel):
-    """A section of the configuration: unknown keys and impossible values are errors."""
+    """A section of the configuration: unknown keys and impossible values are errors.
+
+    So is a value of another type: "0.15" or true for a number.
+    """
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, validate_default=True
     )
 
 

@@ -1,3 +1,5 @@
+import codecs
+import re
 from pathlib import Path
 
 import pytest
@@ -36,11 +38,26 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         ("", "cameras is missing"),
         ("cameras = 3", "cameras"),
         ("[[cameras]", "is not TOML"),
-        ("a=" + "[" * 5000, "is not TOML: a number or brackets in brackets"),
+        ("a=" + "[" * 5000, "is not TOML: it has brackets in brackets"),
+        (_CAMERA + "[workers]\ncount = " + "9" * 5000, "is not TOML: it has a number of thousands"),
+        (_CAMERA + "[spool]\n[spool]", "is not TOML: Cannot declare spool twice (at line 7"),
+        (_CAMERA + "[sync]\nlive_hz = 2,5", "(live_hz = 2,5: write a point, 1.8)"),
         (
-            _CAMERA + "[workers]\ncount = " + "9" * 5000,
-            "is not TOML: a number or brackets in brackets",
+            _CAMERA + "[sync]\nlive_hz = '2.5'",
+            'live_hz: must be a number, without quotes (found "2',
         ),
+        (
+            _CAMERA + "[workers]\ncount = true",
+            "must be a whole number, without quotes (found true)",
+        ),
+        (_CAMERA + "[drift]\nrefuse_scans = 1", "must be true or false, without quotes (found 1)"),
+        (_CAMERA + "[spool]\nfolder = 3", "spool.folder: must be a path in quotes (found 3)"),
+        ("spool = 3\n" + _CAMERA, "spool: must be a section with keys of its own (found 3)"),
+        ("name = 3\n" + _CAMERA, "name: must be a text in quotes (found 3)"),
+        (f"name = '{61 * 'a'}'\n" + _CAMERA, "name: must have at most 60 characters"),
+        (_CAMERA + "[volume]\nmin_m = 3", "volume.min_m: must be a list in brackets (found 3)"),
+        (_CAMERA + "[volume]\nmin_m = [1, 2, 3, 4]", "min_m: must have at most 3 values (found [1"),
+        (_CAMERA + "[deliver]\nname = 'o'", "deliver: there can be several; write [[deliver]]"),
         (_CAMERA + "colour = true", "unknown key cameras.0.colour; allowed here: name, driver"),
         (_CAMERA + "[sync]\ntolerence_s = 1", "unknown key sync.tolerence_s; allowed here: tol"),
         (_CAMERA + "[sync]\ntolerance_s = -1", "sync.tolerance_s: must be greater than 0"),
@@ -68,6 +85,21 @@ def test_an_impossible_value_names_the_file_and_the_key(
     assert words in str(raised.value)
     assert "booth.toml" in str(raised.value)
     assert "\n" not in str(raised.value)
+    assert not re.search("Input|parse|valid|Tuple|class|Path|codec|\\(found {", str(raised.value))
+
+
+@pytest.mark.parametrize("mark", [b"", codecs.BOM_UTF8])
+def test_a_file_of_any_editor_is_read(tmp_path: Path, mark: bytes) -> None:
+    path = tmp_path / "booth.toml"
+    path.write_bytes(mark + _CAMERA.replace("\n", "\r\n").encode())
+    assert load_config(path).camera("front")
+
+
+def test_a_file_in_another_encoding_is_told_so(tmp_path: Path) -> None:
+    path = tmp_path / "booth.toml"
+    path.write_bytes(_CAMERA.encode("utf-16"))
+    with pytest.raises(ConfigError, match=r"booth\.toml is not text in UTF-8; save it as UTF-8"):
+        load_config(path)
 
 
 def test_a_missing_file_says_what_writes_one(tmp_path: Path) -> None:
