@@ -14,11 +14,17 @@ _SMALLEST_BALL_M = 0.07
 """Seven of eight are found at 2.6 m; of 60 mm balls three, of 50 mm balls none beyond 2.4 m."""
 
 
-def _found_afar(radius_m: float) -> float:
+def _radius(radius_m: float) -> float:
     if radius_m < _SMALLEST_BALL_M:
         raise ValueError(
             f"a ball of less than {_SMALLEST_BALL_M:g} m in radius is not found reliably beyond "
             "2.4 m, so front and back cameras rarely see it together: use a larger one"
+        )
+    # No diameter of a ball that is large enough can pass for a radius.
+    if radius_m >= 2.0 * _SMALLEST_BALL_M:
+        raise ValueError(
+            f"must be below {2.0 * _SMALLEST_BALL_M:g} m: give the ball's radius, which is half "
+            "its diameter, in metres"
         )
     return radius_m
 
@@ -72,7 +78,7 @@ class CalibrateConfig(Strict):
     """Calibration of the booth."""
 
     folder: ConfigPath = Field(default=Path("calibrations"), description="all dated calibrations")
-    ball_radius_m: Annotated[float, AfterValidator(_found_afar)] = Field(default=0.1, le=0.3)
+    ball_radius_m: Annotated[float, AfterValidator(_radius)] = 0.1
     reference: str = Field(
         default="", description="the camera whose frame the others are solved in first"
     )

@@ -167,10 +167,12 @@ def test_steps_in_the_wrong_order_say_which_comes_first(config: Path, recordings
 
 def test_another_ball_is_not_mixed_in(config: Path, recordings: Path) -> None:
     assert _run(config, recordings, "floor").returncode == 0
-    config.write_text(config.read_text().replace("[calibrate]", "[calibrate]\nball_radius_m = 0.2"))
+    config.write_text(
+        config.read_text().replace("[calibrate]", "[calibrate]\nball_radius_m = 0.12")
+    )
     done = _run(config, recordings, "ball")
     assert done.returncode == 1
-    assert "radius of 0.1 m, but booth.toml says 0.2 m" in done.stderr
+    assert "radius of 0.1 m, but booth.toml says 0.12 m" in done.stderr
     anew = _run(config, config.parent, "--new")
     assert "what was seen so far is kept" in anew.stdout
     assert (config.parent / "calibrations/abandoned-1/scene/front-lower.npz").exists()
