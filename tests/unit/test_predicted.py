@@ -81,16 +81,16 @@ def _nothing_seen() -> Coverage:
     ],
 )
 def test_what_could_spoil_sizes_is_refused(limits: Limits, words: str) -> None:
-    check_predicted(SAID, Limits(), _nothing_seen(), stood=False, boarded=False)
+    check_predicted(SAID, Limits(), _nothing_seen(), heights=0, boarded=False)
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, limits, _nothing_seen(), stood=False, boarded=False)
+        check_predicted(SAID, limits, _nothing_seen(), heights=0, boarded=False)
     assert words in str(raised.value)
     assert (STAND_WORDS if "heights" in words else BOARD_WORDS) in str(raised.value)
 
 
 def test_whoever_used_a_stand_is_not_told_to() -> None:
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), stood=True, boarded=True)
+        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), heights=2, boarded=True)
     assert "stand" not in str(raised.value).replace("understand", "")
     assert "wave the ball longer" in str(raised.value)
 
@@ -126,3 +126,9 @@ def test_a_job_tells_the_measurements(
     sizes = (5e-4, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
     assert [(one.height_sigma_m, one.girth_sigma_m) for one in told] == [sizes, sizes]
     assert {one.crown_sigma_m for one in told} == {3e-3}
+
+
+def test_whoever_showed_one_height_is_asked_for_two() -> None:
+    """The advice was to wave longer, which does not help."""
+    with pytest.raises(CalibrationError, match="show the ball at two measured heights, not one"):
+        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), heights=1, boarded=True)

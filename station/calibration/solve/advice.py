@@ -24,10 +24,9 @@ def advice(
     weak = [] if coverage.enough else [coverage.advice()]
     if words := resting_ball.doubt_words(problem, state):
         weak.append(words)
-    stood = bool(problem.heights_m)
     if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
-        weak.append(f"for heights, {refusals.remedy(stood, refusals.STAND_WORDS)}")
-    elif not stood:
+        weak.append(f"for heights, {refusals.heights_remedy(len(problem.heights_m))}")
+    elif not problem.heights_m:
         weak.append(f"for heights, {refusals.STAND_WORDS}")
     if not boarded(problem):
         weak.append(f"for girths, {refusals.BOARD_WORDS}")

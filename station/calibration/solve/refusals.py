@@ -45,6 +45,7 @@ STAND_WORDS = (
     "hang the ball above the mark, or put it on a stand, at measured heights (station calibrate "
     "stand)"
 )
+BOTH_HEIGHTS_WORDS = "show the ball at two measured heights, not one (station calibrate stand)"
 BOARD_WORDS = "show a flat board at three distances (station calibrate depth)"
 
 
@@ -195,18 +196,23 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         )
 
 
-def remedy(done: bool, step: str) -> str:
-    """Advice against uncertain heights or girths; ``done``: the step that helps them was done."""
-    return "wave the ball longer" if done else f"{step}, and wave the ball longer"
+def heights_remedy(heights: int) -> str:
+    """Advice against uncertain heights, where the ball was seen at so many measured ones."""
+    return _remedy((STAND_WORDS, BOTH_HEIGHTS_WORDS, "")[min(heights, 2)])
+
+
+def _remedy(step: str) -> str:
+    """Advice with the step that helps; "" where it was done."""
+    return f"{step}, and wave the ball longer" if step else "wave the ball longer"
 
 
 def check_predicted(
-    predicted: PredictedError, limits: Limits, coverage: Coverage, stood: bool, boarded: bool
+    predicted: PredictedError, limits: Limits, coverage: Coverage, heights: int, boarded: bool
 ) -> None:
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
     for what, sigma_m, limit_m, advice in (
-        ("heights", predicted.height_sigma_m, limits.height_m, remedy(stood, STAND_WORDS)),
-        ("girths", predicted.girth_sigma_m, limits.girth_m, remedy(boarded, BOARD_WORDS)),
+        ("heights", predicted.height_sigma_m, limits.height_m, heights_remedy(heights)),
+        ("girths", predicted.girth_sigma_m, limits.girth_m, _remedy("" if boarded else BOARD_WORDS)),
     ):
         if not SIGMAS_95 * sigma_m <= limit_m:
             more = "" if coverage.enough else f"; {coverage.advice()}"
