@@ -165,8 +165,18 @@ def test_a_board_needs_the_empty_booth_first(config: Path, store: CalibrationSto
     """The operator had set up the board before he was told."""
     _begin(store)
     refused = _run(config, "depth")
-    assert "the empty booth has to be recorded first" in str(refused.exception)
+    assert "has to be recorded first: station calibrate floor" in str(refused.exception)
     assert "board" not in refused.output
+
+
+def test_a_board_is_not_sent_to_a_step_that_begins_anew(
+    config: Path, store: CalibrationStore
+) -> None:
+    """The empty booth was named, which begins another calibration in place of the one in use."""
+    _begin(store)
+    store.use(store.finish(replace(default_rig(), created="2026-11-01T10:00:00Z"), {}).name)
+    refused = _run(config, "depth")
+    assert "station calibrate goes through all steps" in str(refused.exception)
 
 
 def test_a_stand_is_a_step_of_its_own(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -158,7 +158,7 @@ class Procedure(Attempt):
         # Live, a further board is added to those that were seen; recordings have their own places.
         session = self.session_to_add_to()
         if session is None or not session.done(EMPTY):
-            raise CalibrationError(EMPTY_FIRST)
+            raise CalibrationError(self._empty_first())
         self.check_station()
         live = self.recordings is None
         before = session.wall_count if live else 0
@@ -173,6 +173,16 @@ class Procedure(Attempt):
                 return
             with self.feed(numbered_step(WALL, place)) as (feed, session):
                 look_at_wall(feed, session, self.guide, place)
+
+    def _empty_first(self) -> str:
+        """Words on a board without the empty booth, which would begin another calibration where
+        none is being done."""
+        if self.unfinished_session() is not None:
+            return EMPTY_FIRST
+        return (
+            "there is no empty booth that a board could be added to; station calibrate goes "
+            "through all steps"
+        )
 
     def _board_stands(self, place: int, *, first: bool, asked: bool) -> bool:
         """Wait until the operator has put up the board; false if it is not wanted there."""

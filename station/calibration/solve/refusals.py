@@ -212,7 +212,12 @@ def check_predicted(
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
     for what, sigma_m, limit_m, advice in (
         ("heights", predicted.height_sigma_m, limits.height_m, heights_remedy(heights)),
-        ("girths", predicted.girth_sigma_m, limits.girth_m, _remedy("" if boarded else BOARD_WORDS)),
+        (
+            "girths",
+            predicted.girth_sigma_m,
+            limits.girth_m,
+            _remedy("" if boarded else BOARD_WORDS),
+        ),
     ):
         if not SIGMAS_95 * sigma_m <= limit_m:
             more = "" if coverage.enough else f"; {coverage.advice()}"
