@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from running_station import Station
 
 from station.calibration.detect.scene import static_view
+from station.calibration.drift.last_check import last_check
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.sensors.recording import write_recording
 from station.simulation.scene import Mesh, bumped, fixed_posts, load_mesh
@@ -85,6 +86,9 @@ def test_a_scan_is_refused_when_a_camera_has_moved(
     assert "camera front-upper has moved" in checked.stdout
     assert "camera back-upper shows no move, but" in checked.stdout
     assert "does not look as it did" in checked.stdout
+    kept = last_check(station.config.parent / "console")
+    assert kept is not None
+    assert kept["moved"] == ["front-upper"]
 
 
 def test_a_scan_is_accepted_when_none_has(

@@ -88,7 +88,7 @@ print(json.dumps({"kind": "done", "text": sys.stdin.readline().strip()}), flush=
 
 
 def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
-    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
     with pytest.raises(RefusedError, match="nothing is waiting"):
         tasks.answer("1.7")
     tasks._begin("calibrate", "stand", [sys.executable, "-c", _ASKS])
@@ -100,21 +100,6 @@ def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
     tasks.answer("1.7")
     _until(lambda: not tasks.state()["running"])
     assert tasks.state()["lines"] == ["1.7"]
-
-
-def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: Path) -> None:
-    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
-    moves = [
-        {"camera": "front-lower", "moved": False, "lost": False, "changed": True},
-        {"camera": "front-upper", "moved": False, "lost": False, "changed": False},
-    ]
-    checked = f"import sys; print({json.dumps(json.dumps(moves))}); sys.exit(4)"
-    tasks._begin("check", "", [sys.executable, "-c", checked])
-    _until(lambda: not tasks.state()["running"])
-    last = tasks.last_check()
-    assert last is not None
-    assert (last["moved"], last["changed"]) == ([], ["front-lower"])
-    assert tasks.state()["error"] == ""
 
 
 _TWO_STEPS = """
@@ -129,7 +114,7 @@ say(kind="done", text="the ball at rest is seen by front-lower")
 
 
 def test_what_a_step_complained_of_is_not_said_of_the_next(tmp_path: Path) -> None:
-    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
     tasks._begin("calibrate", "all", [sys.executable, "-c", _TWO_STEPS])
     _until(lambda: bool(tasks.state()["waits_for"]))
     assert tasks.state()["lines"] == ["more positions would help"]
@@ -140,7 +125,7 @@ def test_what_a_step_complained_of_is_not_said_of_the_next(tmp_path: Path) -> No
 
 
 def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
-    tasks = Tasks(tmp_path / "booth.toml", tmp_path, EventLog())
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
     command = [sys.executable, "-c", _ASKS]
     request = threading.Thread(target=lambda: tasks._begin("calibrate", "stand", command))
     request.start()

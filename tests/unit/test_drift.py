@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift.estimate import estimate_move
+from station.calibration.drift.last_check import keep_check, last_check
 from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
 from station.calibration.drift.reference import DriftReference, plane_slopes
 from station.core.errors import FormatError
@@ -309,3 +310,15 @@ def test_depths_that_changed_are_told_in_front_of_plain_walls() -> None:
         nearer = [np.round(0.997 * frame).astype(np.uint16) for frame in frames[20:]]
         moves.append(estimate_move(before, nearer, DEPTH_SCALE_M))
     assert "nearer than when they were" in str(depths_words(moves))
+
+
+def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: Path) -> None:
+    """One made in a terminal was not kept at all: the page said that there had been none."""
+    assert last_check(tmp_path) is None
+    sure = 1e-8 * np.eye(6)
+    keep_check(
+        tmp_path, [CameraMove("a", np.zeros(6), sure, 0.6), CameraMove("b", np.zeros(6), sure, 1.0)]
+    )
+    last = last_check(tmp_path)
+    assert last is not None
+    assert (last["moved"], last["changed"]) == ([], ["a"])

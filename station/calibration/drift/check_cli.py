@@ -12,6 +12,7 @@ import numpy as np
 
 from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.kept import use_correction
+from station.calibration.drift.last_check import keep_check
 from station.calibration.drift.motion import CameraMove, depths_words, move_words
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
@@ -66,6 +67,8 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
         click.echo(json.dumps([_document(move) for move in moves]))
     else:
         _tell(moves, changed, moved=moved)
+    if recordings is None:
+        keep_check(config.console.folder, moves)
     if moved:
         sys.exit(_EXIT_MOVED)
     if changed:

@@ -8,6 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from station.calibration.drift.last_check import last_check
 from station.calibration.guide.store import CalibrationStore, Entry
 from station.console.api.console import (
     COOKIE,
@@ -257,7 +258,7 @@ def _calibration_in_use(console: Console) -> str:
 
 
 def _last_check(console: Console) -> Check | None:
-    check = console.tasks.last_check()
+    check = last_check(console.config.console.folder)
     if check is None:
         return None
     # Versions that did not keep what had changed wrote files that may still be there.

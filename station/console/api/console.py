@@ -62,7 +62,7 @@ class Console:
         self.watch = Watch(self.config, self.events, self.log)
         self.pictures = Pictures(self.config, self.log)
         self.countdown = ScanCountdown(self.config, self.events)
-        self.tasks = Tasks(self.config_path, folder, self.events)
+        self.tasks = Tasks(self.config_path, self.events)
         self.throttle, self.checking = LoginThrottle(), threading.BoundedSemaphore(AT_ONCE)
         self.heart = Heartbeat(self.config.runtime.folder, "console")
 

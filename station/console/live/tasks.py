@@ -9,14 +9,12 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import Future
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from station.console.live.control import RefusedError
 from station.console.live.events import EventLog
-from station.core.files import write_json
 from station.core.service import die_with_parent
 
 _LINES_KEPT = 60
@@ -24,15 +22,14 @@ _EXITS_OF_A_CHECK = (0, 3, 4)
 """No camera has moved; one has; the booth looks too different to tell."""
 _ANSWERS = {"go": ("go",), "yes or no": ("yes", "no"), "height": ("no",)}
 """Kind of question -> the words that answer it; a height is answered by a number, too."""
-CHECK_FILE = "last-check.json"
 _Started = Future[subprocess.Popen[str]]
 
 
 class Tasks:
     """The current task, or the last one."""
 
-    def __init__(self, config_path: Path, folder: Path, events: EventLog) -> None:
-        self._config_path, self._folder, self._events = config_path, folder, events
+    def __init__(self, config_path: Path, events: EventLog) -> None:
+        self._config_path, self._events = config_path, events
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._state = _idle()
@@ -41,14 +38,6 @@ class Tasks:
         """The current task, its messages, the answer that it is waiting for."""
         with self._lock:
             return {**self._state, "lines": list(self._state["lines"])}
-
-    def last_check(self) -> dict[str, Any] | None:
-        """The last check of the cameras: its time and what was found."""
-        try:
-            document = json.loads((self._folder / CHECK_FILE).read_text())
-        except (OSError, ValueError):
-            return None
-        return document if isinstance(document, dict) else None
 
     def calibrate(self, step: str, new: bool) -> dict[str, Any]:
         """Start a step of the calibration, or all.
@@ -138,9 +127,7 @@ class Tasks:
                 said = json.loads(line)
             except ValueError:
                 continue
-            if isinstance(said, list):
-                self._keep_check(said)
-            elif isinstance(said, dict):
+            if isinstance(said, dict):
                 self._handle(said)
         words = process.stderr.read().strip().splitlines()
         code = process.wait()
@@ -175,13 +162,6 @@ class Tasks:
                 case "error":
                     state["error"] = text
         self._tell()
-
-    def _keep_check(self, moves: list[Any]) -> None:
-        now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        bad = [m["camera"] for m in moves if m["moved"] or m["lost"]]
-        changed = [m["camera"] for m in moves if m["changed"]]
-        found = {"time": now, "moved": bad, "changed": changed, "cameras": moves}
-        write_json(self._folder / CHECK_FILE, found)
 
     def _tell(self) -> None:
         self._events.append("calibration", self.state())
