@@ -114,7 +114,7 @@ def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None
     waving.send_signal(signal.SIGINT)
     told = waving.communicate(timeout=30)[0]
     assert waving.returncode == 130, told
-    assert "stopped; what was seen is kept: station calibrate goes on from here" in told
+    assert "stopped; what was seen is kept; station calibrate goes on from here" in told
     session = Session.load(folder)
     assert session.balls
     assert not session.done(MARK)

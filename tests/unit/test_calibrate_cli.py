@@ -22,6 +22,7 @@ from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
+from station.console.live import guided
 from station.core.errors import BoothError, CalibrationError
 from station.core.rig import Rig
 from station.simulation.scene import default_rig
@@ -113,6 +114,23 @@ def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore)
     _begin(store)
     listed = _run(config, "--list").output
     assert listed == "  unfinished, started 2026-11-21T10:00:00Z: nothing yet\n"
+
+
+@pytest.mark.parametrize(("balls", "kept"), [(0, "nothing was recorded"), (1, "what was seen is")])
+def test_a_step_that_is_stopped_says_what_is_kept(
+    config: Path, store: CalibrationStore, monkeypatch: pytest.MonkeyPatch, balls: int, kept: str
+) -> None:
+    """The page, and the command once a step had begun, spoke of what was seen where nothing was."""
+
+    def stopped(_: Procedure) -> None:
+        raise KeyboardInterrupt
+
+    session = _begin(store)
+    session.record_balls(balls * [ball(next(iter(CAMERAS)), 0.0)])
+    monkeypatch.setattr(Procedure, "empty", stopped)
+    with pytest.raises(CalibrationError, match=f"stopped; {kept}"):
+        guided.run(config, "floor", new=False)
+    assert f"stopped; {kept}" in _run(config, "floor").output
 
 
 @pytest.mark.parametrize(

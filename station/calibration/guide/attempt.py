@@ -75,6 +75,12 @@ class Attempt:
         )
         return f"kept, and not in use yet: {following}"
 
+    def kept(self) -> str:
+        """Words on what is left of a step that was stopped."""
+        session = self.unfinished_session()
+        seen = session is not None and session.anything
+        return "what was seen is kept" if seen else "nothing was recorded"
+
     def see_at_rest(self, step: str) -> tuple[Session, list[BallDetection]]:
         """The ball where it was put in a step, and the calibration that it is seen in."""
         with self.feed(step) as (feed, session):

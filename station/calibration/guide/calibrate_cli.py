@@ -80,9 +80,7 @@ def _called(
         with store.locked():
             return command(procedure, *args, **kwargs)
     except (KeyboardInterrupt, click.Abort):
-        kept = "what was seen is kept: station calibrate goes on from here"
-        seen = procedure.unfinished_session()
-        click.echo(f"  stopped; {kept if seen else 'nothing was recorded'}")
+        click.echo(f"  stopped; {procedure.kept()}; station calibrate goes on from here")
         raise
     finally:
         guide.end_line()

@@ -113,6 +113,11 @@ class Seen:
         """Seconds in which the waved ball was seen."""
         return len({int(ball.time_s) for ball in self.balls})
 
+    @property
+    def anything(self) -> bool:
+        """Whether there is something to keep."""
+        return any((self.balls, self.mark, self.front, self.planes, self.around, self.lenses))
+
     def summary(self) -> str:
         """Summary of the observations so far, for the operator."""
         parts = {

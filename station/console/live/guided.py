@@ -16,7 +16,7 @@ from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.raised_ball import see_all_heights
 from station.calibration.guide.store import CalibrationStore
 from station.core.config_file import load_config
-from station.core.errors import BoothError
+from station.core.errors import BoothError, CalibrationError
 
 STEPS = ("all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve")
 _PROGRESS_S = 0.2
@@ -84,35 +84,42 @@ def run(config_path: Path, step: str, new: bool) -> None:
     """Run one step, or all remaining steps.
 
     Raises:
-        BoothError: as `station calibrate` does.
+        BoothError: as `station calibrate` does; or the operator stopped it.
     """
     config = load_config(config_path)
     recordings = config.console.recordings
     store = CalibrationStore(config.calibrate.folder, config.calibration)
     guide = PageGuide(recordings is None, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)
-    with store.locked():
-        if new:
-            store.set_aside()
-        match step:
-            case "all":
-                procedure.run()
-            case "floor":
-                procedure.empty()
-            case "ball":
-                procedure.ball()
-            case "mark" | "front":
-                procedure.rest(MARK if step == "mark" else FRONT)
-            case "around":
-                procedure.around(asked=False)
-            case "stand":
-                see_all_heights(procedure, again=True)
-            case "depth":
-                procedure.walls(asked=False)
-            case "solve":
-                procedure.solve()
+    try:
+        with store.locked():
+            if new:
+                store.set_aside()
+            _do(procedure, step)
+    except KeyboardInterrupt:
+        raise CalibrationError(f"stopped; {procedure.kept()}") from None
     if step not in ("all", "solve"):
         guide.say(procedure.following("the computation puts it into use"))
+
+
+def _do(procedure: Procedure, step: str) -> None:
+    match step:
+        case "all":
+            procedure.run()
+        case "floor":
+            procedure.empty()
+        case "ball":
+            procedure.ball()
+        case "mark" | "front":
+            procedure.rest(MARK if step == "mark" else FRONT)
+        case "around":
+            procedure.around(asked=False)
+        case "stand":
+            see_all_heights(procedure, again=True)
+        case "depth":
+            procedure.walls(asked=False)
+        case "solve":
+            procedure.solve()
 
 
 def main() -> int:
@@ -122,9 +129,6 @@ def main() -> int:
         run(Path(path), step, "new" in rest)
     except BoothError as error:
         print(json.dumps({"kind": "error", "text": str(error)}), flush=True)
-        return 1
-    except KeyboardInterrupt:
-        print(json.dumps({"kind": "error", "text": "stopped; what was seen is kept"}), flush=True)
         return 1
     return 0
 
