@@ -80,6 +80,20 @@ def _person(rng: np.random.Generator, count: int = 8000) -> np.ndarray:
     return np.column_stack([0.18 * np.cos(angle), 0.12 * np.sin(angle), height])
 
 
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_points_without_a_reading_are_left_out(tmp_path: Path, kind: str) -> None:
+    """Clouds of a depth image's pixels, NaN where it has no reading, were refused."""
+    points = _person(np.random.default_rng(3))
+    holed = np.insert(points, [5, 70], [[np.nan, np.nan, np.nan], [0.1, np.nan, 1.0]], axis=0)
+    whole = read_cloud(_written(tmp_path / f"a.{kind}", points), "z")
+    cloud = read_cloud(_written(tmp_path / f"b.{kind}", holed), "z")
+    assert np.array_equal(cloud.points, whole.points)
+    assert (whole.blank, cloud.blank) == (0, 2)
+    points[7, 1] = np.inf
+    with pytest.raises(InputError, match=r"1 of the 8000 points .* are infinite"):
+        read_cloud(_written(tmp_path / f"c.{kind}", points), "z")
+
+
 @pytest.mark.parametrize(
     ("scale", "words"),
     [

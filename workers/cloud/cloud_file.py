@@ -60,7 +60,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
 
     A floor that was scanned too is taken away, and what stands apart on it. Single points below
     the soles are not taken for these. A cloud whose lowest points are slightly above z = 0, as
-    where no camera saw the soles, keeps its heights.
+    where no camera saw the soles, keeps its heights. Points without a reading (NaN) are left out.
     `origin_m` of the cloud is the new origin in the file's frame, in metres, after `up`. The same
     file gives the same points.
 
@@ -69,10 +69,10 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         unit: of the file, a key of `UNITS_M`.
 
     Raises:
-        InputError: the file is missing, is not a cloud, has values that are not finite, or looks
-            like another unit or axis than was said.
+        InputError: the file is missing, is not a cloud, has infinite values, or looks like
+            another unit or axis than was said.
     """
-    cloud = _points_of(path)
+    cloud, blank = _points_of(path)
     cloud.scale(UNITS_M[unit], np.zeros(3))
     cloud.rotate(Z_UP[up], np.zeros(3))
     check_units(np.asarray(cloud.points), unit, up)
@@ -106,22 +106,28 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         camera_names=("cloud",),
         origin_m=(x, y, z),
         scatter_m=scatter_m(tree),
+        blank=blank,
     )
 
 
-def _points_of(path: Path) -> o3d.geometry.PointCloud:
-    """Points of a file, thinned to what the fit can use."""
+def _points_of(path: Path) -> tuple[o3d.geometry.PointCloud, int]:
+    """Points of a file, thinned to what the fit can use, and how many have no reading."""
     if not path.is_file():
         raise InputError(f"{path} is not a file; give a point cloud, .ply or .pcd")
     cloud = _read(path)
     points = np.asarray(cloud.points)
     if not len(points):
         raise InputError(f"{path} holds no points; give a point cloud, .ply or .pcd")
-    if broken := int((~np.isfinite(points)).any(axis=1).sum()):
+    if broken := int(np.isinf(points).any(axis=1).sum()):
         raise InputError(
-            f"{broken} of the {len(points)} points of {path} are not numbers (NaN or infinite); "
-            "remove these and try again"
+            f"{broken} of the {len(points)} points of {path} are infinite; remove these and try "
+            "again"
         )
+    # Clouds of a depth image's pixels are NaN where it has no reading.
+    blank = np.isnan(points).any(axis=1)
+    if blank.any():
+        cloud = cloud.select_by_index(np.flatnonzero(~blank))
+        points = np.asarray(cloud.points)
     if len(points) > _MAX_POINTS:
         kept = np.random.default_rng(len(points)).permutation(len(points))[:_MAX_POINTS]
         cloud = cloud.select_by_index(np.sort(kept))
@@ -131,7 +137,7 @@ def _points_of(path: Path) -> o3d.geometry.PointCloud:
         raise InputError(
             f"{path} has {len(cloud.points)} different points; a body needs {MIN_POINTS}"
         )
-    return cloud
+    return cloud, int(blank.sum())
 
 
 def _read(path: Path) -> o3d.geometry.PointCloud:

@@ -69,6 +69,8 @@ class PointCloud:
     """The origin of a bare cloud's points in its own frame, turned z up."""
     scatter_m: float = 0.0
     """Standard deviation of a bare cloud's points about the skin; 0 where cameras say it."""
+    blank: int = 0
+    """Points of a bare cloud's file that have no reading (NaN) and are not among these."""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -91,8 +91,12 @@ def fit(
         else:
             assert cloud is not None
             show("reading", 0.0)
+            points = read_cloud(cloud, up, unit)
+            if points.blank:
+                said = f"{cloud}: {points.blank} points without a reading (NaN) are left out"
+                click.echo(said, err=True)
             summary = job.reconstruct_cloud(
-                read_cloud(cloud, up, unit),
+                points,
                 cloud.stem,
                 temporary,
                 method=method,
