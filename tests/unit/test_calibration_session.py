@@ -12,7 +12,7 @@ from seen_balls import CAMERAS, ball
 
 from station.calibration.detect.detections import PlaneObservation
 from station.calibration.detect.scene import static_view
-from station.calibration.detect.step_names import EMPTY, MARK
+from station.calibration.detect.step_names import EMPTY, MARK, raised_height_m
 from station.calibration.guide.seen import Lens
 from station.calibration.guide.session import JOURNAL, SENSORS, Session
 from station.core.errors import CalibrationError, FormatError
@@ -160,6 +160,12 @@ def test_a_height_out_of_sight_is_named(tmp_path: Path, step: str) -> None:
     (session.folder / JOURNAL).write_text(json.dumps(entry) + "\n")
     with pytest.raises(FormatError, match="line 1 cannot be read"):
         Session.load(tmp_path)
+
+
+def test_a_height_of_hundreds_of_digits_is_none() -> None:
+    """It overflowed, instead of the error that whoever reads a height waits for."""
+    with pytest.raises(ValueError, match="does not end with the height"):
+        raised_height_m(f"stand-{400 * '9'}")
 
 
 def test_nested_nonsense_is_named(tmp_path: Path) -> None:

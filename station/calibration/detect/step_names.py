@@ -18,6 +18,8 @@ RAISED_M = (0.3, 2.2)
 PLACES = (AROUND, *RAISED)
 """Steps of the resting ball that may be repeated elsewhere."""
 _JOINT = "-"
+_DIGITS = 4
+"""Digits of the largest of these heights in millimetres; hundreds of them make no float."""
 
 
 def kind_of(step: str) -> str:
@@ -44,7 +46,8 @@ def raised_height_m(step: str) -> float | None:
     kind, _, millimetres = step.partition(_JOINT)
     if kind not in RAISED:
         return None
-    height_m = 1e-3 * int(millimetres) if millimetres.isdecimal() else 0.0
+    written = millimetres.isdecimal() and len(millimetres) <= _DIGITS
+    height_m = 1e-3 * int(millimetres) if written else 0.0
     if not RAISED_M[0] <= height_m <= RAISED_M[1] or step != raised_step(kind, height_m):
         low, high = (1e3 * height for height in RAISED_M)
         raise ValueError(
