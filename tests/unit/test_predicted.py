@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,6 +14,8 @@ from station.calibration.adjust.problem import Sightings
 from station.calibration.detect.coverage import Coverage
 from station.calibration.solve.acceptance import HeldOut, held_out_seconds, widen_by_test
 from station.calibration.solve.refusals import BOARD_WORDS, STAND_WORDS, Limits, check_predicted
+from station.calibration.solve.solution import Solution
+from station.calibration.solve.world import WorldPoses
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import PredictedError
@@ -132,3 +135,12 @@ def test_whoever_showed_one_height_is_asked_for_two() -> None:
     """The advice was to wave longer, which does not help."""
     with pytest.raises(CalibrationError, match="show the ball at two measured heights, not one"):
         check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), heights=1, boarded=True)
+
+
+def test_the_vertical_is_told_as_calibration_json_has_it() -> None:
+    """The floor's own scatter was told, a third of what the file says where nothing hung."""
+    said = replace(SAID, tilt_sigma_rad=np.radians(0.18))
+    poses = WorldPoses({}, np.zeros((0, 0)), 0.1, np.radians(0.06))
+    rig = replace(default_rig(), predicted=said)
+    told = Solution(rig, poses, {}, (), {}, 0.1).summary()
+    assert "what is vertical is known to within 0.18 degrees" in told

@@ -44,7 +44,7 @@ AROUND_WORDS = (
 )
 
 
-def leveled_by(problem: Problem) -> str:
+def _leveled_by(problem: Problem) -> str:
     """Words of what the world's horizontal is taken from."""
     return "the floor's slope" if plumb_ends(problem) is None else "what is vertical"
 
@@ -61,7 +61,7 @@ def check_slope(problem: Problem, world_poses: WorldPoses) -> None:
     if world_poses.slope_sigma_rad > _LARGEST_SLOPE_RAD:
         advice = slope_words(problem) or _HANG_ANEW
         raise CalibrationError(
-            f"{leveled_by(problem)} is only known to within "
+            f"{_leveled_by(problem)} is only known to within "
             f"{np.degrees(world_poses.slope_sigma_rad):.2f} degrees: {advice}"
         )
 

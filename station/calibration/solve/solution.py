@@ -29,8 +29,6 @@ class Solution:
     """Offset of each camera's clock against the reference's."""
     radius_m: float
     """The ball's, as all cameras measured it."""
-    leveled_by: str
-    """Words of what the world's horizontal is taken from."""
 
     def summary(self) -> list[str]:
         """Lines for the operator."""
@@ -56,8 +54,8 @@ class Solution:
                 f"{1e3 * SIGMAS_95 * self.rig.predicted.height_sigma_m:.1f} mm and girths to "
                 f"{1e3 * SIGMAS_95 * self.rig.predicted.girth_sigma_m:.1f} mm (95 %)"
             )
-        slope_deg = np.degrees(self.world_poses.slope_sigma_rad)
-        lines.append(f"{self.leveled_by} is known to within {slope_deg:.2f} degrees")
+            tilt_deg = np.degrees(self.rig.predicted.tilt_sigma_rad)
+            lines.append(f"what is vertical is known to within {tilt_deg:.2f} degrees")
         return lines + [f"could be better: {words}" for words in self.weak]
 
     @property

@@ -94,8 +94,7 @@ def solve(
         refusals.check_predicted(predicted, limits, coverage, heights, boarded(problem))
         rig = replace(rig, predicted=predicted)
         weak = advice(problem, state, predicted, world_poses, limits, coverage)
-        leveled_by = resting_ball.leveled_by(problem)
-        return Solution(rig, world_poses, found, weak, state.clock_s, measured_m, leveled_by)
+        return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
 
 
 def _tested(
