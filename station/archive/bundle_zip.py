@@ -10,7 +10,7 @@ from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
 from station.archive.tables import FILES, Unit, csv_table, read_measurements
-from station.archive.terms import Language
+from station.core.words.terms import Language
 
 MEDIA_TYPES = {
     ".json": "application/json",

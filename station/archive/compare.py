@@ -11,7 +11,7 @@ import numpy as np
 
 from station.archive.surfaces import Array, aligned, distances, read_mesh
 from station.archive.tables import DIGITS, PER_METRE, Pose, Unit, read_measurements
-from station.archive.terms import Language, plain_name, split_side
+from station.core.words.terms import Language, plain_name, split_side
 
 
 @dataclass(frozen=True, slots=True)

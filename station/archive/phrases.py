@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from station.archive.terms import Language
+from station.core.words.terms import Language
 
 PHRASES = Path(__file__).parent / "phrases.json"
 _GAP = re.compile(r"\{(\w+)\}")

@@ -24,7 +24,7 @@ from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.archive.surfaces import read_mesh
 from station.archive.tables import DIGITS, Pose, Unit, read_measurements, rows, side_differences
-from station.archive.terms import Language
+from station.core.words.terms import Language
 
 _WIDTH, _HEIGHT = A4
 _MARGIN = 34.0

@@ -6,7 +6,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from station.archive.records import ScanRecord
-from station.archive.terms import TERMS, plain_name, split_side
+from station.core.words.terms import TERMS, plain_name, split_side
 
 VERSION = "0.3.4"
 _NO_SYSTEM = "998"

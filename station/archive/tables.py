@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from station.archive.records import ScanRecord
-from station.archive.terms import Language, plain_name, split_side
 from station.core.errors import FormatError
+from station.core.words.terms import Language, plain_name, split_side
 
 Unit = Literal["cm", "in", "m"]
 Pose = Literal["as-scanned", "standard"]

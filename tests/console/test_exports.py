@@ -26,11 +26,11 @@ from station.archive.sheet import sheet_pdf
 from station.archive.smis import seamly_name, smis
 from station.archive.surfaces import Surface, aligned, distances
 from station.archive.tables import csv_table, read_measurements, rows
-from station.archive.terms import TERMS, plain_name, split_side
 from station.core.config_file import load_config
 from station.core.geometry import so3_exp
 from station.core.service import set_up_logs
 from station.core.spool import Spool
+from station.core.words.terms import TERMS, plain_name, split_side
 from station.handover.deliver_cli import HandOver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from workers.measure.definitions import DEFINITIONS
@@ -55,7 +55,7 @@ def _scan(label: str) -> ScanRecord:
 def test_every_measurement_has_a_name_in_both_languages() -> None:
     for definition in DEFINITIONS:
         stem, _ = split_side(definition.name)
-        assert stem in TERMS, f"{definition.name} has no plain name (station.archive.terms)"
+        assert stem in TERMS, f"{definition.name} has no plain name (station.core.words.terms)"
     assert plain_name("wrist_girth_left") == "Wrist girth, left"
     assert plain_name("wrist_girth_left", "zh") == "左腕围"
     assert len({term.zh for term in TERMS.values()}) == len(TERMS)

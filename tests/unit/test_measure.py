@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from true_measurements import TrueBody
 
-from station.archive.terms import TERMS
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
+from station.core.words.terms import TERMS
 from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing

@@ -42,8 +42,10 @@ def test_meshes_are_measured_without_a_fit(model: BodyModel, tmp_path: Path) -> 
             assert row["value_m"] == pytest.approx(values[row["name"]], abs=1e-3), row["name"]
             assert row["interval95_m"] == [row["value_m"]] * 2
     table = _run(str(tmp_path / "mesh.ply"))
-    assert "waist_girth" in table
-    assert "volume" in table
+    # As pictures, the page and the printed sheet name them.
+    assert "\nWaist girth " in table
+    assert "\nInside leg " in table
+    assert "\nVolume " in table
 
 
 def test_a_results_tables_are_printed_with_their_intervals(
@@ -75,7 +77,7 @@ def test_a_results_tables_are_printed_with_their_intervals(
     assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
     table = _run(str(tmp_path)).splitlines()
     assert table[:2] == ["verdict: rescan", "reason: the left arm is hidden"]
-    assert any(line.startswith("hand_length_left") and "not measured" in line for line in table)
+    assert any(line.startswith("Hand length, left ") and "not measured" in line for line in table)
     both = CliRunner().invoke(measure, [str(tmp_path), "--json", "--csv"])
     assert both.exit_code == 2
     assert "not both" in both.output

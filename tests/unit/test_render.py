@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from station.core.geometry import so3_exp
-from workers.export.preview import _spread, preview, views_of
+from workers.export.preview import _label, _spread, preview, views_of
 from workers.measure.body import Measurement, measure_body
 from workers.pictures.render import BACKGROUND, Frame, Scene
 from workers.scape.fit.verdict import Verdict
@@ -98,6 +98,13 @@ def test_labels_keep_clear_of_the_body_and_of_each_other(
     assert crowded[-1] <= 500.0
     picture = _decoded(preview(views_of(model.mean, model.faces), rows, OK))
     assert picture.shape[1] > bare.shape[1] + 400
+
+
+def test_a_label_has_the_name_of_the_tables(rows: list[Measurement]) -> None:
+    """The picture said "chest" and "wrist right" beside a table with other words."""
+    labels = {row.name: _label(row) for row in rows}
+    assert labels["chest_girth"].startswith("Chest or bust girth  ")
+    assert labels["wrist_girth_right"].startswith("Wrist girth, right  ")
 
 
 def test_only_a_scan_to_repeat_says_so(model: BodyModel, rows: list[Measurement]) -> None:

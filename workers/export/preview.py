@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.geometry import so3_exp
+from station.core.words.terms import plain_name
 from workers.measure.body import Measurement
 from workers.pictures.render import (
     BACKGROUND,
@@ -116,10 +117,7 @@ def _rows(by_name: dict[str, Measurement], names: tuple[str, ...]) -> list[Measu
 
 
 def _label(row: Measurement) -> str:
-    words = [word for word in row.name.split("_") if word != "girth"]
-    if words[-1] in ("left", "right"):
-        words.insert(0, words.pop())
-    return f"{' '.join(words)}  {100 * row.value_m:.1f} cm"
+    return f"{plain_name(row.name)}  {100 * row.value_m:.1f} cm"
 
 
 def _frame(vertices: Array, view: str) -> Frame:

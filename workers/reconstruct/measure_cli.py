@@ -13,10 +13,12 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 
 from station.core.errors import FormatError, InputError
 from station.core.files import read_json
+from station.core.words.terms import plain_name
 
 _DIGITS = 5
 """Decimals in tables: hundredths of a millimetre, far below any interval."""
 _BLANK = "not measured"
+_NAME_WIDTH = 34
 
 
 @click.command()
@@ -186,21 +188,23 @@ def _print_table(document: dict[str, Any]) -> None:
     for row in document["measurements"]:
         tail = f"{words.get(row['name'], '')}{_in_brackets(row.get('standard'))}"
         if row["value_m"] is None:
-            click.echo(f"{row['name']:<31}{_BLANK:>14}{'':<26}{tail}")
+            click.echo(f"{_named(row['name'])}{_BLANK:>14}{'':<26}{tail}")
             continue
         low, high = row["interval95_m"]
         span = f"{100 * low:6.1f} to {100 * high:5.1f}" if high > low else ""
         basis = row.get("basis") or ""
         basis = "" if basis == "seen" else basis
         unseen = unseen or bool(basis)
-        click.echo(f"{row['name']:<31}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}")
+        click.echo(
+            f"{_named(row['name'])}{100 * row['value_m']:7.1f} cm  {span:<16} {basis:<9}{tail}"
+        )
     if unseen:
         click.echo("partly, inferred: the cameras saw a part of this line, or hardly any of it")
     _print_differences(document)
     for name, unit, content in _contents(document):
         low, high = content["interval95"]
         span = f"{low:6.4f} to {high:6.4f}" if high > low else ""
-        click.echo(f"{name:<31}{content['value']:7.4f} {unit}  {span}")
+        click.echo(f"{_named(name)}{content['value']:7.4f} {unit}  {span}")
 
 
 def _print_differences(document: dict[str, Any]) -> None:
@@ -216,9 +220,14 @@ def _print_differences(document: dict[str, Any]) -> None:
         side = "left" if row["value_m"] > 0.0 else "right"
         size, ends = abs(row["value_m"]), sorted(map(abs, row["interval95_m"]))
         click.echo(
-            f"{row['name']:<31}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
+            f"{_named(row['name'])}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
             f"{100 * ends[1]:5.1f}    larger on the {side}"
         )
+
+
+def _named(name: str) -> str:
+    """A row's name as pictures and sheets have it, as wide as the column of names."""
+    return f"{plain_name(name):<{_NAME_WIDTH}}"
 
 
 def _in_brackets(standard: str | None) -> str:

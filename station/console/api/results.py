@@ -19,12 +19,12 @@ from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
 from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows, side_differences
-from station.archive.terms import Language
 from station.console.api.console import SCAN_ID, Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
 from station.console.api.problems import ProblemError, responses
 from station.console.api.scans import of_record
 from station.core.errors import FormatError
+from station.core.words.terms import Language
 
 router = APIRouter(prefix="/scans/{scan_id}", tags=["results"])
 FileName = Annotated[str, PathParameter(pattern=r"^[a-z0-9][a-z0-9.-]{0,60}$")]

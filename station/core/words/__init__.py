@@ -1,0 +1,1 @@
+"""Words that the booth and its workers share: names of measurements."""
