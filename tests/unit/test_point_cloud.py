@@ -9,7 +9,7 @@ import pytest
 from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from workers.cloud import cloud_file
-from workers.cloud.bare import floor_sigma_m, roughness
+from workers.cloud.bare import floor_sigma_m, roughness, several_people
 from workers.cloud.cloud_file import read_cloud
 from workers.cloud.observed import PointCloud
 
@@ -118,6 +118,16 @@ def test_the_axis_that_points_up_is_named(
         with pytest.raises(InputError, match=rf"lying down\? .* points up: --up {up}"):
             read_cloud(path, stated)
     assert np.ptp(read_cloud(path, up).points[:, 2]) == pytest.approx(1.75, abs=0.01)
+
+
+def test_two_people_are_told_as_such(tmp_path: Path) -> None:
+    """Only what did not match a body was told: the left thigh, the head, a lean."""
+    first, second = (_person(np.random.default_rng(seed)) for seed in (2, 3))
+    alone = read_cloud(_written(tmp_path / "a.ply", first), "z")
+    both = np.concatenate([first, second + np.array([0.7, 0.0, 0.0])])
+    (found,) = several_people(read_cloud(_written(tmp_path / "b.ply", both), "z"))
+    assert several_people(alone) == ()
+    assert found.message.startswith("two people")
 
 
 @pytest.mark.parametrize("length", [0.0, 10.0, np.nan])

@@ -1,4 +1,4 @@
-"""Points of a bare cloud beside the skin that those around them lie on: strays, and scatter."""
+"""What a bare cloud holds beside a person's skin: strays, scatter, somebody else."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from workers.cloud.observed import Finding, PointCloud
+from workers.cloud.people import count_people
 
 Array = NDArray[np.float64]
 
@@ -68,6 +69,14 @@ def roughness(cloud: PointCloud) -> tuple[Finding, ...]:
         "smooth the cloud, or take more points"
     )
     return (Finding("rough", None, cloud.scatter_m, message),)
+
+
+def several_people(cloud: PointCloud) -> tuple[Finding, ...]:
+    """The finding that a cloud holds more than one person, where it does."""
+    if count_people(cloud.points) < 2:
+        return ()
+    message = "two people (or a large object) in the cloud: cut one person out"
+    return (Finding("two-people", None, None, message),)
 
 
 def _patches(around: Array, places: Array) -> tuple[Array, Array, Array]:

@@ -19,7 +19,7 @@ import numpy as np
 from station.core.bundle import read_bundle
 from station.core.config import Volume
 from station.core.rig import PredictedError
-from workers.cloud.bare import floor_sigma_m, roughness
+from workers.cloud.bare import floor_sigma_m, roughness, several_people
 from workers.cloud.observed import PointCloud, Preprocessed
 from workers.cloud.preprocess import preprocess
 from workers.cloud.preprocess import warm_up as compile_preprocessing
@@ -141,7 +141,7 @@ def reconstruct_cloud(
     with watch.step("load"):
         model = model or load_model()
     with watch.step("preprocess"):
-        scan = Preprocessed(cloud, (), roughness(cloud))
+        scan = Preprocessed(cloud, (), (*several_people(cloud), *roughness(cloud)))
     return _fitted(model, scan, Origin(scan_id), method, out_folder, watch, progress, observer)
 
 

@@ -68,6 +68,8 @@ _UPRIGHT = ("head", "neck", "thigh", "shin", "foot")
 _SCATTER_M = 0.006
 """Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
 sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
+_NO_BODY = "too much of the scan does not match a body: nothing can be measured"
+_ON_ITS_HEAD = "if the cloud stands on its head, say which axis points up (--up)"
 _NONE: Mapping[str, str] = MappingProxyType({})
 
 
@@ -209,7 +211,7 @@ def judge(
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         reasons.append("what stands in the booth does not look like a person")
     if everywhere:
-        reasons.append("too much of the scan does not match a body: nothing can be measured")
+        reasons.append(_NO_BODY if camera_shifts_m else f"{_NO_BODY}; {_ON_ITS_HEAD}")
     # What lies beside a body whose arm or head was not found may be that.
     told = [reason for part, reason in lost.items() if part or not misplaced]
     reasons += [*halves, *told[:_PARTS_NAMED]]
