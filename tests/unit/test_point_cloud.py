@@ -11,6 +11,7 @@ from station.core.geometry import so3_exp
 from workers.cloud import cloud_file
 from workers.cloud.bare import floor_sigma_m, roughness, several_people
 from workers.cloud.cloud_file import read_cloud
+from workers.cloud.floor import Z_UP
 from workers.cloud.observed import PointCloud
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
@@ -118,6 +119,17 @@ def test_the_axis_that_points_up_is_named(
         with pytest.raises(InputError, match=rf"lying down\? .* points up: --up {up}"):
             read_cloud(path, stated)
     assert np.ptp(read_cloud(path, up).points[:, 2]) == pytest.approx(1.75, abs=0.01)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_axis_may_point_down(tmp_path: Path, axis: int) -> None:
+    """Camera frames have y down: no --up turned their clouds onto the feet."""
+    upright = np.roll(_person(np.random.default_rng(2)), axis - 2, axis=1)
+    up = "xyz"[axis]
+    cloud = read_cloud(_written(tmp_path / "a.ply", upright), up)
+    turned = read_cloud(_written(tmp_path / "b.ply", -upright), f"-{up}")
+    assert np.allclose(np.sort(turned.points[:, 2]), np.sort(cloud.points[:, 2]), atol=1e-5)
+    assert np.linalg.det(Z_UP[f"-{up}"]) == pytest.approx(1.0)
 
 
 def test_two_people_are_told_as_such(tmp_path: Path) -> None:

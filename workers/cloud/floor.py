@@ -18,8 +18,12 @@ Z_UP = {
     "z": np.eye(3),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
 }
-"""Axis of a file that points up -> rotation to z up."""
+"""Axis of a file that points up -> rotation to z up; "-y" of one that points down, as in camera
+frames."""
 _UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _ADULTS_M = (1.2, 2.3)
 """Statures that tell a unit from the others."""

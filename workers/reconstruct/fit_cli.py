@@ -20,7 +20,11 @@ from workers.scape.fit.fit import Method
 @click.argument("bundle", type=click.Path(path_type=Path), required=False)
 @click.option("--cloud", type=click.Path(path_type=Path), help="a point cloud, .ply or .pcd")
 @click.option(
-    "--up", type=click.Choice(["z", "y", "x"]), default="z", show_default=True, help="of it"
+    "--up",
+    type=click.Choice(["z", "y", "x", "-z", "-y", "-x"]),
+    default="z",
+    show_default=True,
+    help="of it",
 )
 @click.option(
     "--unit",

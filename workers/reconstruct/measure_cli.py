@@ -32,7 +32,12 @@ _NAME_WIDTH = 34
     show_default=True,
     help="as the person stood, or in the standard standing pose",
 )
-@click.option("--up", type=click.Choice(["z", "y", "x"]), default="z", help="a mesh's upward axis")
+@click.option(
+    "--up",
+    type=click.Choice(["z", "y", "x", "-z", "-y", "-x"]),
+    default="z",
+    help="a mesh's upward axis",
+)
 def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> None:
     """Print the measurements of a result folder, or measure a mesh in the template's topology.
 
