@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -84,14 +85,41 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     assert "3 frames were missed" in capsys.readouterr().out
 
 
+def test_an_operator_is_told_when_what_he_sees_lags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coverage is that of the frames that were looked at, not of the ball in his hand."""
+    ended = threading.Event()
+
+    class Frames(_Frames):
+        @property
+        def over(self) -> bool:
+            if super().over:
+                ended.set()
+            return super().over
+
+    told: list[str] = []
+    # The search begins when the ball has been waved.
+    monkeypatch.setattr(finder, "find_ball", lambda *_, **__: ended.wait() and None)
+    monkeypatch.setattr(Guide, "progress", lambda _, text: told.append(text))
+    rig = default_rig().cameras
+    session = Session.begin(tmp_path, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    feed = cast(Feed, Frames(moments=31, reset_at=31))
+    guide = Guide(attended=False, countdown_s=0.0)
+    wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0)
+    lag = [text.endswith(" frames are still to be looked at)") for text in told[:31]]
+    assert lag == 30 * [False] + [True]
+    assert told[30].endswith(" (62 frames are still to be looked at)")
+
+
 class _Looks:
     """A feed of one frame of each camera, 20 a second, until ``lasts_s``."""
 
     replays = True
-    missed = 0
 
-    def __init__(self, lasts_s: float) -> None:
+    def __init__(self, lasts_s: float, missed: int = 0) -> None:
         self._moments, self._next = round(INDEPENDENT_HZ * lasts_s), 0
+        self.missed = missed
 
     @property
     def over(self) -> bool:
@@ -113,6 +141,7 @@ def _hung(
     lasts_s: float,
     swing_m: float,
     seen: Callable[[float], bool] = lambda _: True,
+    missed: int = 0,
 ) -> list[BallDetection]:
     """The detections kept of a ball that swings; ``seen``: whether it is, at a time (s)."""
     rng = np.random.default_rng(3)
@@ -131,7 +160,7 @@ def _hung(
     rig = default_rig().cameras
     session = Session.begin(folder, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
     guide = Guide(attended=False, countdown_s=0.0)
-    return rest_ball(cast(Feed, _Looks(lasts_s)), session, guide, "hanging-1800")
+    return rest_ball(cast(Feed, _Looks(lasts_s, missed)), session, guide, "hanging-1800")
 
 
 def test_a_swinging_ball_is_averaged_over_whole_swings(
@@ -176,6 +205,13 @@ def test_a_ball_that_hangs_too_shortly_or_swings_is_not_at_rest(
     words = r"no camera sees the ball at rest for 2\.5 s: .*; a recording of it has to last 3 s"
     with pytest.raises(CalibrationError, match=words):
         _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m, seen=seen)
+
+
+def test_a_ball_that_a_slow_machine_missed_is_not_said_to_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(CalibrationError, match="too slow for the replay: 7 frames were missed"):
+        _hung(tmp_path, monkeypatch, lasts_s=2.0, swing_m=1e-3, missed=7)
 
 
 @pytest.mark.parametrize("period_s", [1.1, 1.9, 2.7, 3.1])
