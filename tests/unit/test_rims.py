@@ -62,6 +62,18 @@ def test_a_rim_turns_away_from_its_camera_and_outwards() -> None:
     assert (rims.normals[left] @ pose[:3, 0] < -0.99).all()
 
 
+@pytest.mark.parametrize("lost_px", [1, 2])
+def test_a_hand_is_as_wide_as_the_wall_leaves_it(lost_px: int) -> None:
+    """A camera that loses the outermost pixels of silhouettes, beside the one that flickers."""
+    depth = _finger()
+    depth[190:241, 309:332] = 0.0
+    depth[190 : 240 - lost_px, 310 + lost_px : 331 - lost_px] = FINGER_M
+    _, pixels = _rims(depth)
+    assert pixels[:, 1].max() == pytest.approx(239.5, abs=0.3)
+    assert pixels[:, 0].min() == pytest.approx(309.5, abs=0.3)
+    assert pixels[:, 0].max() == pytest.approx(330.5, abs=0.3)
+
+
 def test_what_hides_a_finger_is_not_its_end() -> None:
     depth = _finger()
     depth[225:300, 250:400] = 1.2
