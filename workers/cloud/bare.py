@@ -1,4 +1,4 @@
-"""What a bare cloud holds beside a person's skin: strays, scatter, somebody else."""
+"""Strays, scatter, somebody else: all that a bare cloud holds beside a person's skin."""
 
 from __future__ import annotations
 
