@@ -18,11 +18,12 @@ from station.calibration.guide.feed import Feed, TimedFrame
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import Session
-from station.calibration.guide.steps import rest_ball, wave_ball
+from station.calibration.guide.steps import look_at_empty_booth, look_at_wall, rest_ball, wave_ball
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import DEPTH_SCALE_M, INDEPENDENT_HZ, TABLE
 from station.sensors.recording import RecordedFrame, check_recording, write_recording
-from station.simulation.scene import default_rig
+from station.simulation.scene import Mesh, box, default_rig, load_mesh
+from station.simulation.sensor import SimulatedBooth, VirtualCamera
 
 _CAMERAS = ("front-lower", "front-upper")
 
@@ -287,3 +288,54 @@ def test_frames_of_a_replay_that_wait_are_kept_on_disk(
         looking.found(wait=True)
     assert sum(size > 0 for size in held) < 10
     assert sorted(seen) == pytest.approx(sorted(TABLE[600:620] * DEPTH_SCALE_M), rel=1e-6)
+
+
+class _Pictures:
+    """A feed that has so many frames of one camera, and then is over."""
+
+    replays = True
+    over = False
+
+    def __init__(self, depth: list[np.ndarray]) -> None:
+        self._depth = depth
+
+    def frames(self) -> list[TimedFrame]:
+        self.over = True
+        return [
+            TimedFrame(_CAMERAS[1], number / 30.0, depth, DEPTH_SCALE_M)
+            for number, depth in enumerate(self._depth)
+        ]
+
+
+def _pictures(scene: SimulatedBooth, body: Mesh | None, count: int) -> list[np.ndarray]:
+    camera = VirtualCamera(scene, _CAMERAS[1], body)
+    return [TABLE[frame.raw] for frame in camera.frames(count)]
+
+
+def test_a_board_has_to_stand_still_and_nobody_beside_it(tmp_path: Path) -> None:
+    """A helper who shifted his weight beside the board was told to leave the booth."""
+    session = Session.begin(
+        tmp_path, "2026-11-21T10:00:00Z", 0.1, {_CAMERAS[1]: default_rig().cameras[_CAMERAS[1]]}
+    )
+    guide = Guide(attended=False, countdown_s=0.0)
+
+    def look(pictures: list[np.ndarray], place: int = 0) -> None:
+        look_at_wall(cast(Feed, _Pictures(pictures)), session, guide, place)
+
+    def helped(y_m: float, shift_m: float) -> list[np.ndarray]:
+        board = box((-0.9, y_m, 0.5), (0.3, y_m + 0.02, 1.7))
+        helper = Mesh(body.vertices + np.array([0.65 + shift_m, 0.3, 0.0]), body.faces)
+        return _pictures(SimulatedBooth(clutter=[board]), helper, 15)
+
+    body = load_mesh(Path(__file__).parents[2] / "station/simulation/bodies/ben.npz")
+    empty = _pictures(SimulatedBooth(), None, 60)
+    look_at_empty_booth(cast(Feed, _Pictures(empty)), session, guide)
+    look(helped(0.3, 0.0) + helped(0.3, 0.03))
+    assert session.wall_count == 1
+    with pytest.raises(CalibrationError, match="the board moved in front of camera front-upper"):
+        look(helped(0.3, 0.0) + helped(0.35, 0.0), 1)
+    with pytest.raises(CalibrationError, match="no camera sees a flat board"):
+        look(empty[:30], 1)
+    with pytest.raises(CalibrationError, match="something moved in front of camera front-upper"):
+        look(empty[:15] + _pictures(SimulatedBooth(), body, 15), 1)
+    assert session.wall_count == 1

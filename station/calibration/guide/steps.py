@@ -13,12 +13,12 @@ from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import smoothed, static_view
 from station.calibration.detect.step_names import HANGING, WALL, numbered_step
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
-from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
+from station.calibration.guide.feed import Feed, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.seen import Seen
 from station.calibration.guide.session import Session
-from station.core.depth.images import Image
+from station.core.depth.images import Image, inverse_depth
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
@@ -44,6 +44,8 @@ _MANY_WAIT = 60
 _OFTEN = 0.9
 _MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
+_BOARD_MOVED_SHARE = 0.1
+"""A board more of which changes by as much is not standing."""
 
 
 def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
@@ -52,7 +54,9 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
     Raises:
         CalibrationError: something moved.
     """
-    taken = _still_frames(feed, session, guide, _EMPTY_FRAMES)
+    taken = _frames(feed, session, guide, _EMPTY_FRAMES)
+    for name, (stack, scale_m) in taken.items():
+        _check_stillness(name, stack, scale_m)
     cameras = session.lensed_cameras()
     floors = [
         floor
@@ -73,10 +77,12 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
 def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None:
     """Keep a flat board (or wall) at one place, as every camera that faces it sees it.
 
+    Whoever put it there may stand beside it, and nobody stands as still as a board.
+
     Raises:
-        CalibrationError: no camera sees a flat surface that was not there before.
+        CalibrationError: no camera sees a flat surface that was not there before, or it moved.
     """
-    taken = _still_frames(feed, session, guide, _WALL_FRAMES)
+    taken = _frames(feed, session, guide, _WALL_FRAMES)
     cameras, name = session.lensed_cameras(), numbered_step(WALL, place)
     walls: list[PlaneObservation] = []
     for camera, (stack, scale_m) in taken.items():
@@ -85,8 +91,11 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
             raise CalibrationError(EMPTY_FIRST)
         wall = observe_wall(stack, scale_m, cameras[camera], name, background)
         if wall is not None:
+            _check_board_stands(wall, stack, scale_m)
             walls.append(wall)
     if not walls:
+        for camera, (stack, scale_m) in taken.items():
+            _check_stillness(camera, stack, scale_m)
         raise CalibrationError(
             "no camera sees a flat board: hold it upright, facing the cameras, 1 m or more wide"
         )
@@ -94,23 +103,19 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
 
-def _still_frames(
+def _frames(
     feed: Feed, session: Session, guide: Guide, frames: int
 ) -> dict[str, tuple[NDArray[np.uint16], float]]:
-    """Each camera's frames (n, h, w) of a booth in which nothing moves, and their scale."""
+    """Each camera's frames (n, h, w), and their scale."""
     taken = gather_frames(feed, session.cameras, frames, guide.progress)
-    for name, seen in taken.items():
-        _check_stillness(name, seen)
     return {
         name: (np.stack([frame.depth for frame in seen]), seen[0].scale_m)
         for name, seen in taken.items()
     }
 
 
-def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
-    scale_m, half = frames[0].scale_m, len(frames) // 2
-    before = static_view((frame.depth for frame in frames[:half]), scale_m)
-    after = static_view((frame.depth for frame in frames[half:]), scale_m)
+def _check_stillness(name: str, stack: NDArray[np.uint16], scale_m: float) -> None:
+    before, after = (static_view(iter(half), scale_m) for half in _halves(stack))
     both = (before.share > _OFTEN) & (after.share > _OFTEN)
     surface, surface_after = (smoothed(v.inverse_depth, v.share)[0] for v in (before, after))
     change = np.abs(surface - surface_after)[both]
@@ -118,6 +123,26 @@ def _check_stillness(name: str, frames: list[TimedFrame]) -> None:
         raise CalibrationError(
             f"something moved in front of camera {name}; leave the booth and do it again"
         )
+
+
+def _check_board_stands(board: PlaneObservation, stack: NDArray[np.uint16], scale_m: float) -> None:
+    """Compare the middles of the board's cells in both halves of the frames."""
+    column, row = np.rint(board.patches[:, :2]).astype(int).T
+    both = []
+    for half in _halves(stack):
+        inverse = inverse_depth(scale_m * half[:, row, column])
+        count = (inverse > 0.0).sum(axis=0)
+        both.append(np.where(count > 0, inverse.sum(axis=0) / np.maximum(count, 1), np.nan))
+    change = np.abs(both[0] - both[1])
+    if float(np.mean(change > _MOVED_PER_M)) > _BOARD_MOVED_SHARE:
+        raise CalibrationError(
+            f"the board moved in front of camera {board.camera}; stand it firmly and do it again"
+        )
+
+
+def _halves(stack: NDArray[np.uint16]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    half = len(stack) // 2
+    return stack[:half], stack[half:]
 
 
 def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[BallDetection]:
