@@ -137,6 +137,12 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(
     )
 
 
+def test_a_folder_is_no_file_for_a_model(tmp_path: Path) -> None:
+    done = CliRunner().invoke(workers_cli.reconstruct, ["train", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "is a directory" in done.output
+
+
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     """A traceback once told an operator nothing about the file that was missing."""
     missing = tmp_path / "booth.toml"

@@ -13,7 +13,10 @@ _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
 
 @click.command()
 @click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="model file to write (.npz)"
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="model file to write (.npz)",
 )
 @click.option(
     "--seed",
