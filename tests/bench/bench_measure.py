@@ -2,11 +2,13 @@
 
     python tests/bench/bench_measure.py                   # the tables, on bodies of the test split
     python tests/bench/bench_measure.py --calibrate 64    # learn the intervals anew: validation
-                                                          # bodies, and half as many unlike them
+                                                          # bodies, half as many unlike them, and
+                                                          # half as many with noise that stays
 
 An ordinary day: each body in a pose of its own, up to 3 cm off the mark, swaying by up to 3 mm,
 each camera off its calibration by up to 1 mm and 0.05 degrees. Unlike bodies: sculpted, before
-sensors that err otherwise than the fit assumes (unlike_bodies.py, unlike_sensor.py).
+sensors that err otherwise than the fit assumes (unlike_bodies.py, unlike_sensor.py). Noisy: bodies
+of the family before sensors two fifths of whose noise stay from frame to frame.
 """
 
 from __future__ import annotations
@@ -118,6 +120,7 @@ MOST_BLANK = 0.1
 """Per cent of all rows: who blanks what is hard to measure holds the rest."""
 FAMILY = Bars((93.0, 97.0), 4.0, 1.5)
 UNLIKE = Bars((92.0, 100.0), 8.0, 3.0)
+NOISY = Bars((92.0, 98.0), 8.0, 3.0)
 
 
 def print_coverage(table: Table, pose: Pose, bars: Bars) -> None:
@@ -209,7 +212,8 @@ def measured_in(
     seconds = []
     for scan in scans:
         fit, sigma_m, seen = scan.fit, scan.fit.vertex_sigma_m, scan.fit.vertex_seen
-        errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m)
+        noise_m = fit.cloud.excess_noise_m
+        errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m, excess_noise_m=noise_m)
         start_s = time.perf_counter()
         bodies["as-scanned"].append(measure_body(model, fit.overlapping, sigma_m, seen, errors))
         bodies["standard"].append(
@@ -225,13 +229,16 @@ def main() -> None:
     )
     parser.add_argument("--bodies", type=int, default=40, help="of the test split, at most 76")
     parser.add_argument("--unlike", type=int, default=20, help="sculpted test bodies, at most 40")
+    parser.add_argument(
+        "--noisy", type=int, default=20, help="before sensors with noise that stays"
+    )
     parser.add_argument("--anew", type=int, default=10, help="scans of one body standing anew")
     parser.add_argument(
         "--calibrate",
         type=int,
         metavar="BODIES",
-        help="learn the intervals anew on so many bodies of the validation split (at most 80), and "
-        "half as many sculpted development bodies",
+        help="learn the intervals anew on so many bodies of the validation split (at most 80), "
+        "half as many sculpted development bodies, and half as many with noise that stays",
     )
     parser.add_argument("--scans", type=Path, help="keep what is rendered here, and use it again")
     arguments = parser.parse_args()
@@ -246,11 +253,15 @@ def main() -> None:
         # A quarter more than wanted: some are told to be scanned again.
         scans = accepted(studio.population("test", arguments.bodies * 5 // 4), arguments.bodies)
         unlike = accepted(studio.unlike("test", arguments.unlike), arguments.unlike)
+        noisy = accepted(studio.noisy("test", arguments.noisy * 5 // 4), arguments.noisy)
         again = accepted(studio.anew(arguments.anew), arguments.anew)
     print_all(model, scans, FAMILY)
     if unlike:
         print("\nbodies and sensors unlike the model's")
         print_all(model, unlike, UNLIKE)
+    if noisy:
+        print("\nthe family before sensors with noise that stays from frame to frame")
+        print_all(model, noisy, NOISY)
     if again:
         repeated, _ = measured_in(model, again)
         print_repeatability({pose: table_of(again, repeated[pose], pose) for pose in POSES})
@@ -260,13 +271,17 @@ def calibrate(studio: Studio, count: int) -> None:
     """Learn the intervals' error models and write them as the package's data."""
     family = accepted(studio.population("validation", count), count)
     unlike = accepted(studio.unlike("development", count // 2), count // 2)
+    noisy = accepted(studio.noisy("validation", count // 2), count // 2)
     made_of = {
         "validation_bodies": len(family),
         "unlike_development_bodies": len(unlike),
+        "noisy_validation_bodies": len(noisy),
         "model_sha256": studio.model.sha256,
     }
-    family_errors, unlike_errors = (row_errors(studio.model, scans) for scans in (family, unlike))
-    path = write_shipped(family_errors, unlike_errors, made_of)
+    family_errors, unlike_errors, noisy_errors = (
+        row_errors(studio.model, scans) for scans in (family, unlike, noisy)
+    )
+    path = write_shipped(family_errors, unlike_errors, noisy_errors, made_of)
     print(f"{path}: error models of {len(family_errors['standard'])} rows")
 
 

@@ -16,6 +16,7 @@ from unlike_bodies import UnlikeBodies, UnlikeSplit
 from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
+from station.simulation import violations
 from station.simulation.scene import Mesh, astray, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
@@ -58,17 +59,27 @@ class Studio:
         for part, turn in turns.items():
             self._standing[0, self._database.bones.index(PARTS[part][1][0])] = turn
 
-    def population(self, split: Split, count: int) -> Iterator[Scan]:
-        """The first so many bodies of a split, each in a pose of its own."""
+    def population(
+        self, split: Split, count: int, switches: frozenset[str] = frozenset()
+    ) -> Iterator[Scan]:
+        """The first so many bodies of a split, each in a pose of its own.
+
+        Args:
+            switches: names of `station.simulation.violations` that the sensors have.
+        """
         shapes = self._database.sample(split, _POOL, _SEED[split])
         poses = self._database.sample_poses(split, _POOL, _SEED[split])
         for index in range(min(count, _POOL)):
-            name = f"{split}-{index:03d}"
+            name = "-".join((split, *sorted(switches), f"{index:03d}"))
             one = shapes.take(np.array([index]))
             posed = (self._posed(one, pose) for pose in np.roll(poses, -index, axis=0))
             neutral = self._database.vertices(one)[0]
             body = first_with_room(neutral, posed, self._database.faces)
-            yield self._scan(name, one, body, index)
+            yield self._scan(name, one, body, index, switches)
+
+    def noisy(self, split: Split, count: int) -> Iterator[Scan]:
+        """The first so many bodies of a split before sensors with noise that stays."""
+        return self.population(split, count, frozenset({violations.FROZEN}))
 
     def unlike(self, split: UnlikeSplit, count: int) -> Iterator[Scan]:
         """The first so many sculpted bodies of a split, before sensors unlike the assumed ones."""
@@ -94,7 +105,14 @@ class Studio:
     def _posed(self, shapes: Shapes, pose: Array) -> Array:
         return self._database.vertices(shapes, pose[None])[0]
 
-    def _scan(self, name: str, shapes: Shapes, body: Array, seed: int) -> Scan:
+    def _scan(
+        self,
+        name: str,
+        shapes: Shapes,
+        body: Array,
+        seed: int,
+        switches: frozenset[str] = frozenset(),
+    ) -> Scan:
         rng = np.random.default_rng((seed, 77))
         middle = 0.5 * (body.min(axis=0) + body.max(axis=0))
         body = body - (*(middle[:2] + rng.uniform(-0.03, 0.03, 2)), 0.0)
@@ -107,6 +125,7 @@ class Studio:
                     camera: astray(rng.uniform(0.0, 1e-3), np.radians(rng.uniform(0.0, 0.05)), rng)
                     for camera in default_rig().cameras
                 },
+                violations=switches,
             )
             render_bundle(Mesh(body, self._database.faces), bundle, booth)
         standing = self._database.vertices(shapes, self._standing)[0]
@@ -145,10 +164,12 @@ def accepted(scans: Iterator[Scan], wanted: int) -> list[Scan]:
 
 
 def row_errors(model: BodyModel, scans: Sequence[Scan]) -> dict[Pose, dict[str, RowErrors]]:
-    """Errors of each row over scans, both sides of the body together, with the lines' sigmas."""
-    found: dict[Pose, dict[str, tuple[list[float], list[float]]]] = {pose: {} for pose in POSES}
+    """Errors of each row over scans, both sides of the body together, with the lines' sigmas and
+    the scans' noise."""
+    found: dict[Pose, dict[str, list[tuple[float, float, float]]]] = {pose: {} for pose in POSES}
     for scan in scans:
         fit = scan.fit
+        noise = fit.cloud.excess_noise_m
         standing = stood_upright(model, fit.overlapping, fit.state)
         for pose, vertices in zip(POSES, (fit.overlapping, standing), strict=True):
             truth = scan.truth[pose]
@@ -156,18 +177,18 @@ def row_errors(model: BodyModel, scans: Sequence[Scan]) -> dict[Pose, dict[str, 
                 name = trace.definition.name
                 if math.isnan(trace.value_m):
                     continue
-                errors, sigmas = found[pose].setdefault(sides_pooled(name), ([], []))
-                errors.append(trace.value_m - truth[name])
-                sigmas.append(line_sigma(trace, fit.vertex_sigma_m))
+                sigma = line_sigma(trace, fit.vertex_sigma_m)
+                rows = found[pose].setdefault(sides_pooled(name), [])
+                rows.append((trace.value_m - truth[name], sigma, noise))
             measured = measure_body(model, vertices)
             contents = measured.volume_m3, measured.surface_m2
             for name, content in zip(CONTENTS, contents, strict=True):
                 if name not in truth:
                     continue
-                errors, sigmas = found[pose].setdefault(name, ([], []))
-                errors.append(content.value / truth[name] - 1.0)
-                sigmas.append(content_sigma(fit.vertex_sigma_m))
+                sigma = content_sigma(fit.vertex_sigma_m)
+                rows = found[pose].setdefault(name, [])
+                rows.append((content.value / truth[name] - 1.0, sigma, noise))
     return {
-        pose: {name: RowErrors(np.array(e), np.array(s)) for name, (e, s) in rows.items()}
-        for pose, rows in found.items()
+        pose: {name: RowErrors(*np.array(rows).T) for name, rows in of_pose.items()}
+        for pose, of_pose in found.items()
     }

@@ -233,9 +233,9 @@ def test_intervals_hold_what_they_promise() -> None:
     def draw(count: int, strangeness: float) -> RowErrors:
         sigmas = strangeness * rng.uniform(0.5e-3, 3e-3, count)
         errors = 2e-3 + np.hypot(1e-3, 4.0 * sigmas) * rng.standard_normal(count)
-        return RowErrors(errors, sigmas)
+        return RowErrors(errors, sigmas, np.zeros(count))
 
-    found = learned(draw(400, 0.05), draw(200, 1.0))
+    found = learned(draw(400, 0.05), draw(200, 1.0), draw(400, 0.05))
     assert found.bias == pytest.approx(2e-3, abs=6e-4)
     for strangeness in (0.05, 1.0):
         scans = draw(4000, strangeness)
@@ -248,9 +248,24 @@ def test_intervals_hold_what_they_promise() -> None:
 
 
 def test_chance_does_not_pass_for_a_systematic_error() -> None:
-    errors = RowErrors(np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10), np.zeros(40))
-    assert learned(errors, errors).bias == 0.0
-    assert learned(errors, errors).gain == 0.0
+    errors = RowErrors(np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10), np.zeros(40), np.zeros(40))
+    found = learned(errors, errors, errors)
+    assert found.bias == found.gain == found.noise_gain == 0.0
+
+
+def test_noise_that_stays_widens_the_rows_that_it_was_seen_to_spoil() -> None:
+    rng = np.random.default_rng(0)
+
+    def draw(count: int, noise_m: float) -> RowErrors:
+        noises = np.full(count, noise_m)
+        errors = np.hypot(1e-3, 2.0 * noises) * rng.standard_normal(count)
+        return RowErrors(errors, np.zeros(count), noises)
+
+    found = learned(draw(400, 0.0), draw(200, 0.0), draw(200, 2.6e-3))
+    for noise_m in (0.0, 1.3e-3, 2.6e-3):
+        ends = np.array([found.interval(1.0 + e, 0.0, noise_m) for e in draw(4000, noise_m).errors])
+        held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
+        assert 0.92 < held.mean() < 0.985
 
 
 def test_what_a_scan_says_of_itself_widens_the_rows_it_concerns(model: BodyModel) -> None:
@@ -284,9 +299,23 @@ def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) 
 
 
 def test_an_interval_holds_its_value() -> None:
-    low, high = ErrorModel(bias=-8e-3, constant=5e-3, gain=0.0).interval(0.4, 0.0)
+    low, high = ErrorModel(bias=-8e-3, constant=5e-3, gain=0.0, noise_gain=0.0).interval(0.4, 0.0)
     assert low == 0.4
     assert high == pytest.approx(0.413)
+
+
+def test_noisy_readings_get_wider_intervals(model: BodyModel) -> None:
+    sigma = np.full(model.vertex_count, 3e-4)
+    usual, noisy = (
+        measure_body(model, model.mean, sigma, None, ScanErrors(excess_noise_m=noise_m))
+        for noise_m in (0.0, 2.6e-3)
+    )
+    wider = [
+        np.diff(other.interval95_m) > 1.1 * np.diff(one.interval95_m)
+        for one, other in zip(usual.rows, noisy.rows, strict=True)
+    ]
+    assert np.mean(wider) > 0.7
+    assert np.diff(noisy.volume_m3.interval95) > np.diff(usual.volume_m3.interval95)
 
 
 def test_a_poorly_seen_body_gets_wider_intervals(model: BodyModel) -> None:

@@ -146,6 +146,14 @@ def test_skin_is_the_less_known_the_farther_it_is_from_readings(model: BodyModel
     assert like[seen].mean() < 0.1 * near
 
 
+def test_noisy_readings_are_no_mismatch(model: BodyModel) -> None:
+    seen = np.ones(model.vertex_count, bool)
+    mismatch = 0.002 * np.random.default_rng(7).standard_normal(model.vertex_count)
+    strange, noisy = (surface_sigma(model, seen, mismatch, seen, noise) for noise in (0.0, 0.0026))
+    assert strange.mean() > 0.0004
+    assert noisy.mean() < 0.1 * strange.mean()
+
+
 def test_a_missing_limb_is_known_the_less_the_farther_it_reaches(model: BodyModel) -> None:
     seen = model.mean[:, 2] > 0.9
     sigma = surface_sigma(model, seen, np.full(model.vertex_count, 0.001), seen)

@@ -65,6 +65,9 @@ class PointCloud:
     camera: NDArray[np.int16]
     """(n,): index into camera_names."""
     camera_names: tuple[str, ...]
+    excess_noise_m: float = 0.0
+    """Standard deviation of the noise that averaging the frames has left, beyond that of
+    independent readings."""
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The origin of a bare cloud's points in its own frame, turned z up."""
     scatter_m: float = 0.0

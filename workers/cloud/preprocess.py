@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -18,6 +18,7 @@ from station.core.geometry import transform
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m
+from workers.cloud.noise import noise_ratio
 from workers.cloud.observed import (
     LOWERED_FLOOR,
     RAISED_FLOOR,
@@ -32,10 +33,14 @@ from workers.cloud.points import normals, within
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_BILATERAL_DIAMETER_PX = 7
+_BILATERAL_RADII = 1.5
+"""Least radius of the bilateral filter, in standard deviations in the image."""
 _BILATERAL_RANGE_SIGMAS = 2.5
 """Range parameter, in standard deviations of one reading at the person's distance."""
 _BILATERAL_SPACE_PX = 2.0
+"""Standard deviation in the image, times the root of the noise ratio: where two fifths of the
+noise's variance stay, rows of 12 validation bodies err by 2.8 mm with 2 px, 2.6 with 3, 2.8 with 4.
+"""
 _MIN_INCIDENCE_COSINE = np.cos(np.radians(76.0))
 """Readings at a larger angle of incidence are left out."""
 _WINDOW_BORDER_PX = 8
@@ -93,6 +98,8 @@ class _Camera:
     points: Array
     normals: Array
     sigma_m: Array
+    excess_noise_m: float
+    """As in `PointCloud`, of this camera's points."""
     change_m: Array
     unsettled: float
     """Share of the readings in the volume that disagree between frames."""
@@ -127,7 +134,7 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         for name in bundle.rig.cameras
         if name not in names
     ]
-    cloud = _merged(names, clouds)
+    cloud = _merged(names, clouds, [camera.excess_noise_m for camera in cameras])
     floor, raised = _raised_floor(cloud)
     if raised:
         cloud, findings = _without(cloud, floor), [*findings, *raised]
@@ -147,7 +154,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         nothing = np.empty((0, 3))
         none = np.empty(0)
         return _Camera(
-            calibration, depth, np.empty(0, np.int64), nothing, nothing, none, none,
+            calibration, depth, np.empty(0, np.int64), nothing, nothing, none, 0.0, none,
             unsettled, len(bundle.frames[name]), floor_m, _ordered(bundle, name),
         )  # fmt: skip
     # The rest works only on the part of the image that shows the person.
@@ -156,9 +163,10 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     left, right = max(columns[0] - border, 0), min(columns[-1] + border + 1, depth.shape[1])
     window = np.s_[top:bottom, left:right]
     part = np.ascontiguousarray(depth[window])
+    ratio = noise_ratio(part, near[window], averaged.count[window])
     edge = jumps(part)
     typical = float(np.median(part[near[window]]))
-    smooth = filtered(part, typical)
+    smooth = filtered(part, typical, ratio)
     depth[window] = np.where(smooth > 0, smooth, part)
     points = rays(calibration)[window] * smooth[..., None]
     directions, valid = normals(points, smooth)
@@ -179,6 +187,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
         points=local @ pose[:3, :3].T + pose[:3, 3],
         normals=directions.reshape(-1, 3)[at].astype(np.float64) @ pose[:3, :3].T,
         sigma_m=np.hypot(sigma, _SIGMA_FLOOR_M),
+        excess_noise_m=float(np.sqrt((ratio**2 - 1.0) * np.mean(sigma**2))),
         change_m=averaged.change_m[window].ravel()[at].astype(np.float64),
         unsettled=unsettled,
         frames=len(bundle.frames[name]),
@@ -187,17 +196,19 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     )
 
 
-def filtered(depth_m: Image, typical_m: float) -> Image:
+def filtered(depth_m: Image, typical_m: float, noise: float = 1.0) -> Image:
     """Bilateral filter (Tomasi & Manduchi 1998) of averaged readings; missing ones stay 0.
 
     Args:
         typical_m: distance of the person, which sets the noise.
+        noise: `noise_ratio` of the image.
     """
+    space_px = _BILATERAL_SPACE_PX * np.sqrt(noise)
     smooth = cv2.bilateralFilter(
         depth_m,
-        _BILATERAL_DIAMETER_PX,
+        1 + 2 * int(np.ceil(_BILATERAL_RADII * space_px)),
         _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical_m))),
-        _BILATERAL_SPACE_PX,
+        space_px,
     )
     smooth[depth_m == 0.0] = 0.0
     return np.asarray(smooth, np.float32)
@@ -255,14 +266,20 @@ def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Arra
     return view, (camera.points[keep], camera.normals[keep], camera.sigma_m[keep])
 
 
-def _merged(names: list[str], clouds: Sequence[tuple[Array, Array, Array]]) -> PointCloud:
-    sizes = [len(points) for points, _, _ in clouds]
+def _merged(
+    names: list[str],
+    clouds: Sequence[tuple[Array, Array, Array]],
+    excess_noise_m: Sequence[float],
+) -> PointCloud:
+    sizes = np.array([len(points) for points, _, _ in clouds])
+    excess2 = sizes @ np.square(excess_noise_m) / max(1, sizes.sum())
     return PointCloud(
         points=np.concatenate([points for points, _, _ in clouds]),
         normals=np.concatenate([directions for _, directions, _ in clouds]),
         sigma_m=np.concatenate([sigma for _, _, sigma in clouds]),
         camera=np.repeat(np.arange(len(names), dtype=np.int16), sizes),
         camera_names=tuple(names),
+        excess_noise_m=float(np.sqrt(excess2)),
     )
 
 
@@ -283,12 +300,12 @@ def _raised_floor(cloud: PointCloud) -> tuple[Mask, list[Finding]]:
 
 def _without(cloud: PointCloud, left_out: Mask) -> PointCloud:
     kept = ~left_out
-    return PointCloud(
-        cloud.points[kept],
-        cloud.normals[kept],
-        cloud.sigma_m[kept],
-        cloud.camera[kept],
-        cloud.camera_names,
+    return replace(
+        cloud,
+        points=cloud.points[kept],
+        normals=cloud.normals[kept],
+        sigma_m=cloud.sigma_m[kept],
+        camera=cloud.camera[kept],
     )
 
 

@@ -139,13 +139,17 @@ def _measured(
     volume = signed_volume(vertices, model.faces)
     surface = float(triangle_areas(vertices, model.faces).sum())
     further = scan_errors.of_contents(volume, surface, float(np.ptp(vertices[:, 2])))
+
+    def content(name: str, value: float, its_further: float) -> Content:
+        noise_m = scan_errors.excess_noise_m
+        interval = content_interval(name, value, vertex_sigma_m, pose, noise_m, its_further)
+        return Content(value, interval)
+
     return MeasuredBody(
         pose,
         rows,
-        Content(volume, content_interval("volume", volume, vertex_sigma_m, pose, further.volume)),
-        Content(
-            surface, content_interval("surface", surface, vertex_sigma_m, pose, further.surface)
-        ),
+        content("volume", volume, further.volume),
+        content("surface", surface, further.surface),
     )
 
 

@@ -3,17 +3,18 @@
 An ordinary scan of a body of the model's own family has errors of a size that is known for each
 row. To this the scan adds its own uncertainty:
 
-    half width = sqrt(constant^2 + (gain sigma)^2 + (1.96 further)^2),
+    half width = sqrt(constant^2 + (gain sigma)^2 + (noise_gain noise)^2 + (1.96 further)^2),
 
 where sigma is the standard deviation of the surface in excess of an ordinary scan's, rms along the
-row's line (`workers.scape.surface.uncertainty`), and `further` is a standard deviation that
-concerns the whole scan: the calibration's own statement of its errors, and a top of the head that
-no camera saw.
+row's line (`workers.scape.surface.uncertainty`), `noise` that of the readings
+(`workers.cloud.noise`), and `further` is a standard deviation that concerns the whole scan: the
+calibration's own statement of its errors, and a top of the head that no camera saw.
 
 `constant` and the row's systematic error `bias` are learned from scans of held-out bodies of the
 family (conformal calibration: Vovk, Gammerman & Shafer 2005, chapter 4), `gain` from scans of
-sculpted bodies by a sensor whose errors differ from those that the fit assumes, so that an interval
-contains the truth in 95 of 100 cases of either. As scanned, the bias shifts only the interval,
+sculpted bodies by a sensor whose errors differ from those that the fit assumes, `noise_gain` from
+scans by a sensor with noise that stays from frame to frame, so that an interval contains the truth
+in 95 of 100 cases of each. As scanned, the bias shifts only the interval,
 since a value is the length of its line. In the standard pose, which no camera saw, the bias is the
 mean error of re-posing the body, and it is subtracted from the value.
 """
@@ -40,7 +41,7 @@ Array = NDArray[np.float64]
 Pose = Literal["as-scanned", "standard"]
 
 FORMAT = "booth-intervals"
-VERSION = 1
+VERSION = 2
 SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
 _NORMAL_QUANTILE = 1.96
@@ -49,7 +50,7 @@ _MIN_CONSTANT = 0.7
 """Floor of the constant, as a share of what it is without the family's own sigmas: an ordinary scan
 with none of them is no better than that."""
 _MIN_SIGMA_M = 2e-4
-"""Floor of the sculpted bodies' standard deviation in a row, for its gain."""
+"""Floor of the standard deviations that a gain is learned from."""
 _OUTLIER = 6.0
 """Median absolute deviations beyond which an error does not count to the spread."""
 
@@ -61,17 +62,21 @@ class ErrorModel:
     bias: float
     constant: float
     gain: float
+    noise_gain: float
 
-    def interval(self, value: float, sigma: float, further: float = 0.0) -> tuple[float, float]:
+    def interval(
+        self, value: float, sigma: float, noise: float = 0.0, further: float = 0.0
+    ) -> tuple[float, float]:
         """95 % interval of a value whose line has the standard deviation `sigma`.
 
         It always contains the value and no negative length.
 
         Args:
+            noise: standard deviation of the readings in excess of an ordinary scan's, metres.
             further: standard deviation that concerns the whole scan.
         """
-        half = float(np.hypot(self.constant, self.gain * sigma))
-        half = float(np.hypot(half, _NORMAL_QUANTILE * further))
+        parts = (self.constant, self.gain * sigma, self.noise_gain * noise)
+        half = float(np.linalg.norm((*parts, _NORMAL_QUANTILE * further)))
         middle = value - self.bias
         return max(0.0, min(value, middle - half)), max(value, middle + half)
 
@@ -94,6 +99,8 @@ class ScanErrors:
     """Girths, by the same."""
     crown_sigma_m: float = 0.0
     """Top of the head."""
+    excess_noise_m: float = 0.0
+    """The readings' noise, beyond that of ordinary scans. Each row has its own learned gain."""
     skin_sigma_m: Array | None = None
     """(P,): the surface beside patches of the scan that it does not explain, and of a head that
     hair hides. No learned gain applies to it; None for none."""
@@ -129,32 +136,42 @@ def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RowErrors:
-    """Errors (n,) of one row on n scans of known bodies, and the standard deviations (n,) of its
-    lines in these scans."""
+    """Errors (n,) of one row on n scans of known bodies, the standard deviations (n,) of its lines
+    in these scans, and those (n,) of the readings in excess of an ordinary scan's."""
 
     errors: Array
     sigmas: Array
+    noises: Array
 
 
-def learned(family: RowErrors, unlike: RowErrors) -> ErrorModel:
-    """Error model of a row from scans of the model's own family and of bodies unlike it.
+def learned(family: RowErrors, unlike: RowErrors, noisy: RowErrors) -> ErrorModel:
+    """Error model of a row from scans of the model's own family, of bodies unlike it, and of the
+    family by sensors with noise that stays.
 
     The bias is that of the family, shrunk by its own uncertainty (James & Stein 1961, positive
     part), so that noise of the calibration is not taken for a systematic error. The constant is the
-    conformal quantile of the family's errors. The gain explains the mean square of the other
-    bodies' errors beyond the family's, by Student's t for their number.
+    conformal quantile of the family's errors. The gains explain the mean square of the other
+    scans' errors beyond the family's, by Student's t for their number.
     """
     bias = _shrunk_mean(family.errors)
-    ordinary, strange = np.square(family.errors - bias), np.square(unlike.errors - bias)
-    beyond = float(np.mean(strange)) - float(np.mean(ordinary))
-    strangeness = max(float(np.mean(unlike.sigmas**2)), _MIN_SIGMA_M**2)
-    gain = float(np.sqrt(max(beyond, 0.0) / strangeness))
-    gain *= float(stdtrit(len(unlike.errors) - 1, 0.5 + 0.5 * COVERAGE))
+    ordinary = np.square(family.errors - bias)
+    usual = float(np.mean(ordinary))
+    gain = _gain(unlike.errors - bias, usual, unlike.sigmas)
+    noise_gain = _gain(noisy.errors - bias, usual, noisy.noises)
     left = np.sqrt(np.maximum(ordinary - np.square(gain * family.sigmas), 0.0))
     constant = max(
         _conformal_quantile(left), _MIN_CONSTANT * _conformal_quantile(np.sqrt(ordinary))
     )
-    return ErrorModel(bias, constant, gain)
+    return ErrorModel(bias, constant, gain, noise_gain)
+
+
+def _gain(errors: Array, usual: float, sigmas: Array) -> float:
+    """Half width of a 95 % interval per standard deviation that explains the errors' mean square
+    beyond the usual one."""
+    beyond = max(float(np.mean(errors**2)) - usual, 0.0)
+    strangeness = max(float(np.mean(sigmas**2)), _MIN_SIGMA_M**2)
+    student = float(stdtrit(len(errors) - 1, 0.5 + 0.5 * COVERAGE))
+    return student * float(np.sqrt(beyond / strangeness))
 
 
 def _conformal_quantile(sizes: Array) -> float:
@@ -212,6 +229,7 @@ def to_document(
                     "bias": round(model.bias, 6),
                     "constant": round(model.constant, 6),
                     "gain": round(model.gain, 4),
+                    "noise_gain": round(model.noise_gain, 4),
                 }
                 for name, model in rows.items()
             }
@@ -223,6 +241,7 @@ def to_document(
 def write_shipped(
     family: Mapping[Pose, Mapping[str, RowErrors]],
     unlike: Mapping[Pose, Mapping[str, RowErrors]],
+    noisy: Mapping[Pose, Mapping[str, RowErrors]],
     made_of: Mapping[str, Any],
 ) -> Path:
     """Learn the error models of all rows and write them as the package's data.
@@ -230,10 +249,13 @@ def write_shipped(
     Args:
         family: errors by pose and row (`sides_pooled`) on bodies of the model's own family.
         unlike: the same on bodies unlike it.
+        noisy: the same on the family before sensors with noise that stays.
         made_of: splits, numbers of bodies and the model's SHA-256.
     """
     models = {
-        pose: {name: learned(one, unlike[pose][name]) for name, one in rows.items()}
+        pose: {
+            name: learned(one, unlike[pose][name], noisy[pose][name]) for name, one in rows.items()
+        }
         for pose, rows in family.items()
     }
     path = Path(str(resources.files("workers.measure").joinpath(SHIPPED)))
@@ -277,7 +299,7 @@ def intervals(
         sigma, further = line_sigma(trace, vertex_sigma_m), scan_errors.of(trace.definition)
         if scan_errors.skin_sigma_m is not None:
             further = float(np.hypot(further, line_sigma(trace, scan_errors.skin_sigma_m)))
-        found.append(model.interval(value, sigma, further))
+        found.append(model.interval(value, sigma, scan_errors.excess_noise_m, further))
     return found
 
 
@@ -290,16 +312,23 @@ def _model_of(trace: Trace, pose: Pose) -> ErrorModel:
 
 
 def content_interval(
-    name: str, value: float, vertex_sigma_m: Array | None, pose: Pose, further: float = 0.0
+    name: str,
+    value: float,
+    vertex_sigma_m: Array | None,
+    pose: Pose,
+    noise_m: float = 0.0,
+    further: float = 0.0,
 ) -> tuple[float, float]:
     """95 % interval of a volume or a surface, whose error is a share of the value.
 
     Args:
+        noise_m: standard deviation of the readings in excess of an ordinary scan's.
         further: standard deviation that concerns the whole scan, a share of the value.
     """
     if vertex_sigma_m is None:
         return value, value
-    low, high = shipped()[pose][name].interval(1.0, content_sigma(vertex_sigma_m), further)
+    sigma = content_sigma(vertex_sigma_m)
+    low, high = shipped()[pose][name].interval(1.0, sigma, noise_m, further)
     return value * low, value * high
 
 

@@ -218,7 +218,11 @@ def scan_errors(
         patch_sigma_m(model, fit.patches.result()),
         hidden_head_sigma(model, fit.surface.seen, fit.crown_sigma_m),
     )
-    errors = ScanErrors(crown_sigma_m=fit.crown_sigma_m, skin_sigma_m=skin)
+    errors = ScanErrors(
+        crown_sigma_m=fit.crown_sigma_m,
+        excess_noise_m=fit.cloud.excess_noise_m,
+        skin_sigma_m=skin,
+    )
     if predicted is None:
         return replace(errors, height_sigma_m=floor_sigma_m(fit.cloud))
     return replace(

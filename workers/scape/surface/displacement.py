@@ -35,7 +35,7 @@ from workers.scape.surface.contours import contour_places, contour_rows, side_of
 from workers.scape.surface.crossings import Pairs, crossing_pairs
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import offset_prior
-from workers.scape.surface.uncertainty import surface_sigma
+from workers.scape.surface.uncertainty import NOISE_LEFT, surface_sigma
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -71,8 +71,6 @@ _LOCAL_FROM_M = 0.008
 square, counts: those of the model's family have 3 to 6 mm, fists of another 20."""
 _SCAN_SHARE = 0.05
 """Share of the whole scan's mismatch in a vertex's own, for those with few points around."""
-_NOISE_LEFT = 0.8
-"""Standard deviation of the mean of a vertex's points per that of a point: they share most."""
 _MIN_SIGMA_M = 0.0008
 """Floor of the offsets' standard deviation: what the components leave out of the model's own
 bodies."""
@@ -116,7 +114,7 @@ class _Readings:
     information: Array
     """(n,): inverse variance, times the share that is independent."""
     noise_m: float
-    """Rms of the standard deviations of the cloud's points."""
+    """Rms of the standard deviations of the cloud's points, with what averaging has left."""
     tracked: TrackedPoints
 
     @classmethod
@@ -128,7 +126,7 @@ class _Readings:
             points,
             directions,
             _INDEPENDENT / np.maximum(noise, _MIN_NOISE_M) ** 2,
-            float(np.sqrt(np.mean(noise**2))),
+            float(np.sqrt(np.mean(noise**2) + cloud.excess_noise_m**2)),
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
 
@@ -245,7 +243,7 @@ def fit_surface(
     assert before is not None
     fitted = stand_on_floor(model, vertices + offset)
     crossing = started(crossing_pairs, fitted, model.faces)
-    return _examined(model, fitted, readings, before, crossing)
+    return _examined(model, fitted, readings, before, cloud.excess_noise_m, crossing)
 
 
 def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Array:
@@ -255,10 +253,10 @@ def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Ar
 
     Args:
         before: what the cloud says before the surface is displaced.
-        noise_m: rms of the standard deviations of the cloud's points.
+        noise_m: as in `_Readings`.
     """
     prior, observed = offset_prior(model), before.observed.astype(np.float64)
-    of_noise = (_NOISE_LEFT * noise_m) ** 2
+    of_noise = (NOISE_LEFT * noise_m) ** 2
     total = prior.share_around(observed * before.residual_m**2) + _SCAN_SHARE * before.rms_m**2
     around = total / (prior.share_around(observed) + _SCAN_SHARE)
     whole, local = (
@@ -280,6 +278,7 @@ def _examined(
     vertices: Array,
     readings: _Readings,
     before: _AtVertices,
+    excess_noise_m: float,
     crossing: Future[Pairs],
 ) -> SurfaceFit:
     """A fitted surface (P, 3) with what is known of it.
@@ -297,7 +296,7 @@ def _examined(
     measured[model.faces[places.triangle[on_surface]]] = True
     return SurfaceFit(
         vertices=vertices,
-        sigma_m=surface_sigma(model, seen, before.residual_m, before.observed),
+        sigma_m=surface_sigma(model, seen, before.residual_m, before.observed, excess_noise_m),
         seen=seen,
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,

@@ -23,6 +23,8 @@ from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prio
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+NOISE_LEFT = 0.8
+"""Standard deviation of the mean of a vertex's points per that of a point: they share most."""
 _COMMON_SHARE = 0.2
 """Weight of the whole body's amplitude against that of fully seen surroundings."""
 _FAMILY_MISMATCH_M = 0.0013
@@ -48,20 +50,29 @@ _FARTHEST_M = 1.0
 """Distances to readings count up to this."""
 
 
-def surface_sigma(model: BodyModel, seen: Mask, mismatch_m: Array, observed: Mask) -> Array:
+def surface_sigma(
+    model: BodyModel,
+    seen: Mask,
+    mismatch_m: Array,
+    observed: Mask,
+    excess_noise_m: float = 0.0,
+) -> Array:
     """Standard deviation (P,) along the normals, metres.
 
     Args:
         seen: (P,): readings lie on the vertex or next to it.
         mismatch_m: (P,): mean distance of the vertex's readings from the model's surface ...
         observed: (P,): ... where there were any.
+        excess_noise_m: standard deviation of the readings' noise beyond that of ordinary scans,
+            which shows as mismatch, too.
     """
     if not observed.any():
         return np.full(len(seen), _DRIFT * _FARTHEST_M)
     prior = offset_prior(model)
     away = np.minimum(prior.distance_m(seen), _FARTHEST_M)
     around = _amplitude_square(prior, mismatch_m, observed)
-    further = np.clip(around - _FAMILY_MISMATCH_M**2, 0.0, _MAX_FURTHER_M**2)
+    usual2 = _FAMILY_MISMATCH_M**2 + (NOISE_LEFT * excess_noise_m) ** 2
+    further = np.clip(around - usual2, 0.0, _MAX_FURTHER_M**2)
     further *= _unknown_share(away) + _LEFT_WHERE_SEEN**2
     usual = model.vertex_sigma_m**2 * _unknown_share(np.maximum(away - _USUAL_GAP_M, 0.0))
     drift = _DRIFT * np.maximum(away - RANGE_M, 0.0)
