@@ -122,7 +122,7 @@ def test_a_job_tells_the_measurements(
         patches=patches,
         vertices=np.zeros((3, 3)),
         state=None,
-        cloud=SimpleNamespace(floor_sigma_m=5e-4),
+        cloud=SimpleNamespace(floor_sigma_m=5e-4, excess_noise_m=0.0),
     )
     with ThreadPoolExecutor(1) as beside:
         job._measuring(beside, cast(Any, None), cast(Any, fit), predicted, Stopwatch())

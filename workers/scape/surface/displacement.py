@@ -35,7 +35,7 @@ from workers.scape.surface.contours import contour_places, contour_rows, side_of
 from workers.scape.surface.crossings import Pairs, crossing_pairs
 from workers.scape.surface.offset_equations import OffsetRows, solved
 from workers.scape.surface.offset_prior import offset_prior
-from workers.scape.surface.uncertainty import NOISE_LEFT, surface_sigma
+from workers.scape.surface.uncertainty import EXCESS_LEFT, surface_sigma
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -71,6 +71,8 @@ _LOCAL_FROM_M = 0.008
 square, counts: those of the model's family have 3 to 6 mm, fists of another 20."""
 _SCAN_SHARE = 0.05
 """Share of the whole scan's mismatch in a vertex's own, for those with few points around."""
+_NOISE_LEFT = 0.8
+"""Standard deviation of the mean of a vertex's points per that of a point: they share most."""
 _MIN_SIGMA_M = 0.0008
 """Floor of the offsets' standard deviation: what the components leave out of the model's own
 bodies."""
@@ -114,7 +116,7 @@ class _Readings:
     information: Array
     """(n,): inverse variance, times the share that is independent."""
     noise_m: float
-    """Rms of the standard deviations of the cloud's points, with what averaging has left."""
+    """Standard deviation of the mean of a vertex's points."""
     tracked: TrackedPoints
 
     @classmethod
@@ -126,7 +128,11 @@ class _Readings:
             points,
             directions,
             _INDEPENDENT / np.maximum(noise, _MIN_NOISE_M) ** 2,
-            float(np.sqrt(np.mean(noise**2) + cloud.excess_noise_m**2)),
+            float(
+                np.hypot(
+                    _NOISE_LEFT * np.sqrt(np.mean(noise**2)), EXCESS_LEFT * cloud.excess_noise_m
+                )
+            ),
             TrackedPoints(model.neighbours, points, directions, dense=True),
         )
 
@@ -256,11 +262,12 @@ def _offset_sigma_m(model: BodyModel, before: _AtVertices, noise_m: float) -> Ar
         noise_m: as in `_Readings`.
     """
     prior, observed = offset_prior(model), before.observed.astype(np.float64)
-    of_noise = (NOISE_LEFT * noise_m) ** 2
     total = prior.share_around(observed * before.residual_m**2) + _SCAN_SHARE * before.rms_m**2
     around = total / (prior.share_around(observed) + _SCAN_SHARE)
     whole, local = (
-        np.maximum(_SIGMA_PER_MISMATCH * np.sqrt(np.maximum(square - of_noise, 0.0)), _MIN_SIGMA_M)
+        np.maximum(
+            _SIGMA_PER_MISMATCH * np.sqrt(np.maximum(square - noise_m**2, 0.0)), _MIN_SIGMA_M
+        )
         for square in (before.rms_m**2, around)
     )
     return np.where(_of_ends(model), np.maximum(whole, local**2 / _LOCAL_FROM_M), whole)

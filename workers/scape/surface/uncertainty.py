@@ -23,8 +23,9 @@ from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prio
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-NOISE_LEFT = 0.8
-"""Standard deviation of the mean of a vertex's points per that of a point: they share most."""
+EXCESS_LEFT = 0.4
+"""Standard deviation of the mean of a vertex's points per the excess noise of a point, after the
+filter: the mismatch of the family grows from 1.4 to 1.7 mm by 2.6 mm of it."""
 _COMMON_SHARE = 0.2
 """Weight of the whole body's amplitude against that of fully seen surroundings."""
 _FAMILY_MISMATCH_M = 0.0013
@@ -71,7 +72,7 @@ def surface_sigma(
     prior = offset_prior(model)
     away = np.minimum(prior.distance_m(seen), _FARTHEST_M)
     around = _amplitude_square(prior, mismatch_m, observed)
-    usual2 = _FAMILY_MISMATCH_M**2 + (NOISE_LEFT * excess_noise_m) ** 2
+    usual2 = _FAMILY_MISMATCH_M**2 + (EXCESS_LEFT * excess_noise_m) ** 2
     further = np.clip(around - usual2, 0.0, _MAX_FURTHER_M**2)
     further *= _unknown_share(away) + _LEFT_WHERE_SEEN**2
     usual = model.vertex_sigma_m**2 * _unknown_share(np.maximum(away - _USUAL_GAP_M, 0.0))
