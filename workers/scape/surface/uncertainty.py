@@ -23,9 +23,6 @@ from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prio
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-EXCESS_LEFT = 0.4
-"""Standard deviation of the mean of a vertex's points per the excess noise of a point, after the
-filter: the mismatch of the family grows from 1.4 to 1.7 mm by 2.6 mm of it."""
 _COMMON_SHARE = 0.2
 """Weight of the whole body's amplitude against that of fully seen surroundings."""
 _FAMILY_MISMATCH_M = 0.0013
@@ -56,7 +53,7 @@ def surface_sigma(
     seen: Mask,
     mismatch_m: Array,
     observed: Mask,
-    excess_noise_m: float = 0.0,
+    noise_m: float = 0.0,
 ) -> Array:
     """Standard deviation (P,) along the normals, metres.
 
@@ -64,15 +61,14 @@ def surface_sigma(
         seen: (P,): readings lie on the vertex or next to it.
         mismatch_m: (P,): mean distance of the vertex's readings from the model's surface ...
         observed: (P,): ... where there were any.
-        excess_noise_m: standard deviation of the readings' noise beyond that of ordinary scans,
-            which shows as mismatch, too.
+        noise_m: standard deviation of the mismatch by noise beyond that of ordinary scans.
     """
     if not observed.any():
         return np.full(len(seen), _DRIFT * _FARTHEST_M)
     prior = offset_prior(model)
     away = np.minimum(prior.distance_m(seen), _FARTHEST_M)
     around = _amplitude_square(prior, mismatch_m, observed)
-    usual2 = _FAMILY_MISMATCH_M**2 + (EXCESS_LEFT * excess_noise_m) ** 2
+    usual2 = _FAMILY_MISMATCH_M**2 + noise_m**2
     further = np.clip(around - usual2, 0.0, _MAX_FURTHER_M**2)
     further *= _unknown_share(away) + _LEFT_WHERE_SEEN**2
     usual = model.vertex_sigma_m**2 * _unknown_share(np.maximum(away - _USUAL_GAP_M, 0.0))
