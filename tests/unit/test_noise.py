@@ -47,6 +47,15 @@ def test_a_noisy_sensor_shows_as_well() -> None:
     assert _ratio(_averaged(0.0, size=3.0)) == pytest.approx(3.0, rel=0.15)
 
 
+@pytest.mark.parametrize("shape", [(200, 18), (18, 200)])
+def test_noise_shows_along_rows_and_columns(shape: tuple[int, int]) -> None:
+    """A limb may be narrower than the differences reach."""
+    noise = 3.0 * RANDOM_SIGMA / np.sqrt(_FRAMES) * np.random.default_rng(1).normal(size=shape)
+    depth_m = (1.0 / (1.0 / 1.7 + noise)).astype(np.float32)
+    ratio = noise_ratio(depth_m, depth_m > 0.0, np.full(shape, _FRAMES, np.uint16))
+    assert ratio == pytest.approx(3.0, rel=0.15)
+
+
 def test_what_is_not_the_person_does_not_count() -> None:
     depth_m = _averaged(0.0)
     background = np.zeros(_SHAPE, bool)

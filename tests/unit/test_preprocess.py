@@ -6,6 +6,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from workers.cloud.observed import LOWERED_FLOOR, RAISED_FLOOR
 from workers.cloud.one_person import cells_of
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
-from workers.cloud.preprocess import preprocess
+from workers.cloud.preprocess import filtered, preprocess
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
@@ -175,6 +176,28 @@ def test_noise_that_stays_from_frame_to_frame_is_noticed(tmp_path: Path) -> None
     }
     assert noise_m[()] < 0.4e-3
     assert noise_m[FROZEN,] == pytest.approx(2.6e-3, rel=0.15)
+
+
+def test_the_filter_is_wider_before_a_noisy_sensor() -> None:
+    noise = np.random.default_rng(2).standard_normal((60, 60))
+    depth_m = (1.7 + 4e-3 * noise).astype(np.float32)
+    left = [float(filtered(depth_m, 1.7, ratio)[20:40, 20:40].std()) for ratio in (1.0, 4.0, 6.0)]
+    assert left[1] < 0.8 * left[0]
+    assert left[2] < left[1]
+    # However noisy an image is, its filter costs no more, and reaches no farther.
+    assert np.array_equal(filtered(depth_m, 1.7, 100.0), filtered(depth_m, 1.7, 6.0))
+
+
+def test_a_flickering_pixel_of_a_covered_camera_is_no_surface(bundle: Path, tmp_path: Path) -> None:
+    """The noise of no point was not a number, and the fit ended with Python's words."""
+    covered = shutil.copytree(bundle, tmp_path / "covered")
+    image = np.zeros((480, 640), np.uint16)
+    image[240, 320] = 17_000
+    for record in read_bundle(covered).frames["back-lower"]:
+        assert cv2.imwrite(str(covered / record.file), image)
+    scan = preprocess(read_bundle(covered))
+    assert np.isfinite(scan.cloud.excess_noise_m)
+    assert ("camera-blind", "back-lower") in [(f.code, f.camera) for f in scan.findings]
 
 
 def test_a_person_who_moved_is_reported_in_millimetres(tmp_path: Path) -> None:
