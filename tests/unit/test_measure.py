@@ -319,6 +319,24 @@ def test_noisy_readings_get_wider_intervals(model: BodyModel) -> None:
     assert np.median(growth) > 1.1
 
 
+def test_noisy_readings_widen_the_volume_of_a_standing_body(model: BodyModel) -> None:
+    sigma, state = np.zeros(model.vertex_count), model.neutral_state()
+    usual, noisy = (
+        float(np.diff(standing.volume_m3.interval95)[0])
+        for standing in (
+            measure_standing(model, model.mean, state, sigma, None, ScanErrors(excess_noise_m=n))
+            for n in (0.0, 2.6e-3)
+        )
+    )
+    assert noisy > 1.02 * usual
+
+
+@pytest.mark.parametrize("sigma", [(np.nan, 0.0), (0.0, np.nan)])
+def test_an_unknown_error_is_not_told_as_none(sigma: tuple[float, float]) -> None:
+    found = ErrorModel(bias=0.0, constant=5e-3, gain=1.0, noise_gain=1.0).interval(0.9, *sigma)
+    assert np.isnan(found).all()
+
+
 def test_a_poorly_seen_body_gets_wider_intervals(model: BodyModel) -> None:
     sharp = measure_body(model, model.mean, np.full(model.vertex_count, 3e-4))
     blurred = measure_body(model, model.mean, np.full(model.vertex_count, 4e-3))

@@ -78,7 +78,9 @@ class ErrorModel:
         parts = (self.constant, self.gain * sigma, self.noise_gain * noise)
         half = float(np.linalg.norm((*parts, _NORMAL_QUANTILE * further)))
         middle = value - self.bias
-        return max(0.0, min(value, middle - half)), max(value, middle + half)
+        # What is not a number stays so, unlike in the interpreter's own min and max.
+        low, high = np.minimum(value, middle - half), np.maximum(value, middle + half)
+        return float(np.maximum(0.0, low)), float(high)
 
 
 @dataclass(frozen=True, slots=True)
