@@ -159,6 +159,21 @@ def test_noisy_readings_are_no_mismatch(model: BodyModel) -> None:
     assert sigma[2.6e-3, 1.0e-3] > 0.8 * sigma[2.6e-3, 0.0]
 
 
+def test_a_noisy_cloud_is_followed_less(model: BodyModel) -> None:
+    """A body that is 2 mm thicker than the model, or seen through noise of as much."""
+    normals = vertex_normals(model.mean, model.faces)
+    rough = (
+        model.mean + 0.002 * np.random.default_rng(7).standard_normal((len(normals), 1)) * normals
+    )
+    count = len(rough)
+    cloud = PointCloud(rough, normals, np.full(count, 1e-3), np.zeros(count, np.int16), ("all",))
+    usual = fit_surface(model, model.mean, cloud, (), ())
+    noisy = fit_surface(model, model.mean, replace(cloud, excess_noise_m=4e-3), (), ())
+    moved = [np.abs(found.vertices - model.mean).mean() for found in (usual, noisy)]
+    assert moved[1] < 0.8 * moved[0]
+    assert noisy.sigma_m.mean() < 0.8 * usual.sigma_m.mean()
+
+
 def test_a_missing_limb_is_known_the_less_the_farther_it_reaches(model: BodyModel) -> None:
     seen = model.mean[:, 2] > 0.9
     sigma = surface_sigma(model, seen, np.full(model.vertex_count, 0.001), seen)
