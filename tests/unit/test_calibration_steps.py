@@ -322,20 +322,42 @@ def test_a_board_has_to_stand_still_and_nobody_beside_it(tmp_path: Path) -> None
     def look(pictures: list[np.ndarray], place: int = 0) -> None:
         look_at_wall(cast(Feed, _Pictures(pictures)), session, guide, place)
 
-    def helped(y_m: float, shift_m: float) -> list[np.ndarray]:
+    def helped(y_m: float, shift_m: float, count: int = 15) -> list[np.ndarray]:
         board = box((-0.9, y_m, 0.5), (0.3, y_m + 0.02, 1.7))
         helper = Mesh(body.vertices + np.array([0.65 + shift_m, 0.3, 0.0]), body.faces)
-        return _pictures(SimulatedBooth(clutter=[board]), helper, 15)
+        return _pictures(SimulatedBooth(clutter=[board]), helper, count)
 
     body = load_mesh(Path(__file__).parents[2] / "station/simulation/bodies/ben.npz")
     empty = _pictures(SimulatedBooth(), None, 60)
     look_at_empty_booth(cast(Feed, _Pictures(empty)), session, guide)
     look(helped(0.3, 0.0) + helped(0.3, 0.03))
     assert session.wall_count == 1
-    with pytest.raises(CalibrationError, match="the board moved in front of camera front-upper"):
-        look(helped(0.3, 0.0) + helped(0.35, 0.0), 1)
-    with pytest.raises(CalibrationError, match="no camera sees a flat board"):
-        look(empty[:30], 1)
-    with pytest.raises(CalibrationError, match="something moved in front of camera front-upper"):
-        look(empty[:15] + _pictures(SimulatedBooth(), body, 15), 1)
+    away = helped(0.36, 0.0, 10)
+    for moved in (
+        helped(0.3, 0.0) + helped(0.33, 0.0),
+        helped(0.3, 0.0, 4) + 2 * away + away[:6],
+        helped(0.3, 0.0, 10) + away + helped(0.3, 0.0, 10),
+    ):
+        with pytest.raises(CalibrationError, match="the board moved in front of camera front-up"):
+            look(moved, 1)
+    for nothing in (empty[:30], empty[:15] + _pictures(SimulatedBooth(), body, 15)):
+        with pytest.raises(CalibrationError, match="no camera sees a flat board that stands still"):
+            look(nothing, 1)
     assert session.wall_count == 1
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_empty_booth_is_seen_without_anybody_in_it(tmp_path: Path) -> None:
+    session = Session.begin(
+        tmp_path, "2026-11-21T10:00:00Z", 0.1, {_CAMERAS[1]: default_rig().cameras[_CAMERAS[1]]}
+    )
+    body = load_mesh(Path(__file__).parents[2] / "station/simulation/bodies/ben.npz")
+    empty = _pictures(SimulatedBooth(), None, 30)
+    for pictures, words in (
+        (empty + _pictures(SimulatedBooth(), body, 30), "something moved in front of camera"),
+        (60 * [np.zeros((480, 640), np.uint16)], "camera front-upper sees nothing"),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            look_at_empty_booth(
+                cast(Feed, _Pictures(pictures)), session, Guide(attended=False, countdown_s=0.0)
+            )
