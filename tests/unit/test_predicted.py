@@ -84,16 +84,18 @@ def _nothing_seen() -> Coverage:
     ],
 )
 def test_what_could_spoil_sizes_is_refused(limits: Limits, words: str) -> None:
-    check_predicted(SAID, Limits(), _nothing_seen(), heights=0, boarded=False)
+    check_predicted(SAID, Limits(), _nothing_seen(), heights_m=(), boarded=False)
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, limits, _nothing_seen(), heights=0, boarded=False)
+        check_predicted(SAID, limits, _nothing_seen(), heights_m=(), boarded=False)
     assert words in str(raised.value)
     assert (STAND_WORDS if "heights" in words else BOARD_WORDS) in str(raised.value)
 
 
 def test_whoever_used_a_stand_is_not_told_to() -> None:
     with pytest.raises(CalibrationError) as raised:
-        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), heights=2, boarded=True)
+        check_predicted(
+            SAID, Limits(height_m=1e-3), _nothing_seen(), heights_m=(0.9, 1.7), boarded=True
+        )
     assert "stand" not in str(raised.value).replace("understand", "")
     assert "wave the ball longer" in str(raised.value)
 
@@ -122,19 +124,22 @@ def test_a_job_tells_the_measurements(
         patches=patches,
         vertices=np.zeros((3, 3)),
         state=None,
-        cloud=SimpleNamespace(floor_sigma_m=5e-4, excess_noise_m=0.0),
+        cloud=SimpleNamespace(floor_sigma_m=5e-4, excess_noise_m=2.6e-3),
     )
     with ThreadPoolExecutor(1) as beside:
         job._measuring(beside, cast(Any, None), cast(Any, fit), predicted, Stopwatch())
     sizes = (5e-4, 0.0) if predicted is None else (SAID.height_sigma_m, SAID.girth_sigma_m)
     assert [(one.height_sigma_m, one.girth_sigma_m) for one in told] == [sizes, sizes]
-    assert {one.crown_sigma_m for one in told} == {3e-3}
+    assert {(one.crown_sigma_m, one.excess_noise_m) for one in told} == {(3e-3, 2.6e-3)}
 
 
-def test_whoever_showed_one_height_is_asked_for_two() -> None:
+@pytest.mark.parametrize("heights_m", [(1.7,), (1.75, 1.8)], ids=["stand", "stand and hook"])
+def test_whoever_showed_one_height_is_asked_for_two(heights_m: tuple[float, ...]) -> None:
     """The advice was to wave longer, which does not help."""
     with pytest.raises(CalibrationError, match="show the ball at two measured heights, not one"):
-        check_predicted(SAID, Limits(height_m=1e-3), _nothing_seen(), heights=1, boarded=True)
+        check_predicted(
+            SAID, Limits(height_m=1e-3), _nothing_seen(), heights_m=heights_m, boarded=True
+        )
 
 
 def test_the_vertical_is_told_as_calibration_json_has_it() -> None:

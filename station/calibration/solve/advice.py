@@ -25,7 +25,7 @@ def advice(
     if words := resting_ball.doubt_words(problem, state):
         weak.append(words)
     if SIGMAS_95 * predicted.height_sigma_m > 0.5 * limits.height_m:
-        weak.append(f"for heights, {refusals.heights_remedy(len(problem.heights_m))}")
+        weak.append(f"for heights, {refusals.heights_remedy(problem.heights_m.values())}")
     elif not problem.heights_m:
         weak.append(f"for heights, {refusals.STAND_WORDS}")
     if not boarded(problem):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,8 @@ _RESTING_OFF_M = 0.002
 _ONE_PLACE_OFF_M = 0.006
 """At one place; up to 2.4 mm in sound booths."""
 SIGMAS_95 = 1.96
+_ONE_HEIGHT_M = 0.3
+"""Heights that differ by less are one: a ball on a stand, and hung up as high."""
 _START_AGAIN = "fix it, and start again with station calibrate --new"
 STAND_WORDS = (
     "hang the ball above the mark, or put it on a stand, at measured heights (station calibrate "
@@ -196,9 +198,12 @@ def check_held_out(found: Mapping[str, HeldOut]) -> None:
         )
 
 
-def heights_remedy(heights: int) -> str:
-    """Advice against uncertain heights, where the ball was seen at so many measured ones."""
-    return _remedy((STAND_WORDS, BOTH_HEIGHTS_WORDS, "")[min(heights, 2)])
+def heights_remedy(heights_m: Collection[float]) -> str:
+    """Advice against uncertain heights, where the ball was seen at these measured ones."""
+    if not heights_m:
+        return _remedy(STAND_WORDS)
+    one = max(heights_m) - min(heights_m) < _ONE_HEIGHT_M
+    return _remedy(BOTH_HEIGHTS_WORDS if one else "")
 
 
 def _remedy(step: str) -> str:
@@ -207,11 +212,15 @@ def _remedy(step: str) -> str:
 
 
 def check_predicted(
-    predicted: PredictedError, limits: Limits, coverage: Coverage, heights: int, boarded: bool
+    predicted: PredictedError,
+    limits: Limits,
+    coverage: Coverage,
+    heights_m: Collection[float],
+    boarded: bool,
 ) -> None:
     """Refuse a calibration that may spoil heights or girths by more than the booth allows."""
     for what, sigma_m, limit_m, advice in (
-        ("heights", predicted.height_sigma_m, limits.height_m, heights_remedy(heights)),
+        ("heights", predicted.height_sigma_m, limits.height_m, heights_remedy(heights_m)),
         (
             "girths",
             predicted.girth_sigma_m,
