@@ -25,8 +25,12 @@ _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
     show_default=True,
     help="the same seed learns the same model",
 )
-@click.option("--bodies", type=_COUNT, default=1600, show_default=True, help="training bodies")
-@click.option("--poses", type=_COUNT, default=1000, show_default=True, help="training poses")
+@click.option(
+    "--bodies", type=click.IntRange(2), default=1600, show_default=True, help="training bodies"
+)
+@click.option(
+    "--poses", type=click.IntRange(4), default=1000, show_default=True, help="training poses"
+)
 @click.option(
     "--components",
     type=_COUNT,
