@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from typing import TypeVar
 
@@ -22,6 +21,7 @@ from station.calibration.drift.watch import DriftWatch
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, CalibrationError
+from station.core.files import utc_now
 from station.core.rig import Rig
 from station.core.scans import ScanId, ScanNote, boot_id
 from station.core.spool import Spool
@@ -172,7 +172,7 @@ class ScanWriter:
         write_bundle(
             temporary,
             scan_id=order.scan_id,
-            created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+            created=utc_now(),
             label=order.label,
             booth=self._config.name,
             depth_scale_m=collection.depth_scale_m(),

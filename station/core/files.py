@@ -11,8 +11,9 @@ import time
 import uuid
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from station.core.errors import BoothError, FormatError
 
@@ -22,6 +23,11 @@ PRIVATE_FILE_MODE = 0o600
 _LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
 MAX_JSON_BYTES = 16 << 20
 """A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
+
+
+def utc_now(precision: Literal["seconds", "milliseconds"] = "seconds") -> str:
+    """The time that is written into what is made now, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec=precision).replace("+00:00", "Z")
 
 
 def fsync_folder(folder: Path) -> None:

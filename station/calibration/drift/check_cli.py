@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
 
 import click
@@ -22,6 +21,7 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
+from station.core.files import utc_now
 from station.core.rig import Rig
 
 _FRAMES = 30
@@ -68,7 +68,12 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     else:
         _tell(moves, changed, moved=moved)
     if recordings is None:
-        keep_check(config.console.folder, moves)
+        try:
+            keep_check(config.console.folder, moves)
+        except OSError as error:
+            # What was found is told all the same, by the exit code too.
+            reason = error.strerror or str(error)
+            click.echo(f"the console is not told: {config.console.folder}: {reason}", err=True)
     if moved:
         sys.exit(_EXIT_MOVED)
     if changed:
@@ -77,8 +82,7 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
 
 def _correct(config: BoothConfig) -> None:
     """Put a calibration into use that the scans of the last people have corrected."""
-    created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    drift, entry = use_correction(config, created)
+    drift, entry = use_correction(config, utc_now())
     click.echo(
         f"camera {drift.camera} is now taken to stand where the scans of the last people saw "
         f"it: {move_words(drift.xi)} from where it was calibrated"

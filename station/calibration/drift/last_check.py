@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from station.calibration.drift.motion import CameraMove
-from station.core.files import private_folder, write_json
+from station.core.files import private_folder, utc_now, write_json
 
 _FILE = "last-check.json"
 
@@ -17,7 +16,7 @@ _FILE = "last-check.json"
 def keep_check(folder: Path, moves: Sequence[CameraMove]) -> None:
     """Write down, in the console's folder, what a check has found now."""
     found = {
-        "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        "time": utc_now(),
         "moved": [move.camera for move in moves if move.moved or move.lost],
         "changed": [move.camera for move in moves if move.changed],
     }

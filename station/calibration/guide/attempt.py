@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from station.calibration.detect.detections import BallDetection
@@ -18,6 +17,7 @@ from station.calibration.guide.steps import rest_ball
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
+from station.core.files import utc_now
 from station.core.rig import CameraCalibration
 from station.messaging.messages import Request
 from station.messaging.transport import ask_again
@@ -131,8 +131,3 @@ class Attempt:
                 "moved since, begin anew: station calibrate --new"
             )
         return session
-
-
-def utc_now() -> str:
-    """The date of what is made now, ISO 8601."""
-    return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

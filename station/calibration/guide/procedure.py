@@ -14,7 +14,7 @@ from station.calibration.detect.step_names import (
     WALL,
     numbered_step,
 )
-from station.calibration.guide.attempt import Attempt, utc_now
+from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.raised_ball import see_all_heights
 from station.calibration.guide.session import Session
 from station.calibration.guide.steps import (
@@ -25,6 +25,7 @@ from station.calibration.guide.steps import (
     wave_ball,
 )
 from station.core.errors import CalibrationError
+from station.core.files import utc_now
 
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
 _MAX_BOARDS, _MAX_PLACES = 20, 20

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import secrets
 import time
-from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
@@ -26,7 +24,7 @@ from station.console.api.console import (
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, RefusedError, command
-from station.core.scans import boot_id
+from station.core.scans import boot_id, new_scan_id
 from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
@@ -70,8 +68,7 @@ def list_scans(
 @router.post("", status_code=202, responses=responses(404, 409))
 def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Scan:
     """Take a scan. With an Idempotency-Key the same request never scans twice."""
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    fresh = f"{stamp}-{secrets.token_hex(2)}"
+    fresh = new_scan_id()
     mark = f"{fresh} {boot_id()} {time.monotonic():.3f}"
     first = once(console, caller, key, body.model_dump_json(), mark)
     scan_id = first.partition(" ")[0]

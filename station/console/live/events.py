@@ -14,8 +14,9 @@ import threading
 from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any, Literal
+
+from station.core.files import utc_now
 
 Kind = Literal[
     "camera", "framesets", "scan", "job", "result", "fault", "calibration", "delivery", "reset"
@@ -51,7 +52,7 @@ class EventLog:
 
     def append(self, kind: Kind, data: dict[str, Any]) -> None:
         """Append an event; may be called from any thread."""
-        now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        now = utc_now("milliseconds")
         text = json.dumps({"time": now, **data}, ensure_ascii=False, allow_nan=False)
         with self._lock:
             self._number += 1

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
-from datetime import UTC, datetime
 from io import TextIOWrapper
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
-from station.core.files import open_private, private_folder
+from station.core.files import open_private, private_folder, utc_now
 
 FILE = "audit.log"
 _BYTES, _FILES = 5_000_000, 10
@@ -38,7 +37,7 @@ class AuditLog:
     def note(self, who: str, address: str, what: str, scan_id: str = "") -> None:
         """One line."""
         entry = {
-            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "time": utc_now("milliseconds"),
             "who": who,
             "from": address,
             "what": what,
