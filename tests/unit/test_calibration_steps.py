@@ -32,7 +32,6 @@ class _Frames:
     """A feed of a frame of each camera at a time; one camera's clock is reset midway."""
 
     replays = True
-    missed = 3
 
     def __init__(self, moments: int, reset_at: int) -> None:
         self._moments, self._reset_at, self._next = moments, reset_at, 0
@@ -58,7 +57,7 @@ class _Frames:
 
 
 def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames pending at a reset of a clock once fell into the next run, seconds off."""
 
@@ -83,7 +82,9 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     before = [ball for ball in seen.balls if ball.time_s < 2.45]
     assert len(before) == 50
     assert sum(ball.camera == _CAMERAS[0] for ball in before) == 25
-    assert "3 frames were missed" in capsys.readouterr().out
+    assert seen.replayed
+    seen.forget_balls()
+    assert not Session.load(tmp_path).replayed
 
 
 def test_an_operator_is_told_when_what_he_sees_lags(
@@ -118,9 +119,8 @@ class _Looks:
 
     replays = True
 
-    def __init__(self, lasts_s: float, missed: int = 0) -> None:
+    def __init__(self, lasts_s: float) -> None:
         self._moments, self._next = round(INDEPENDENT_HZ * lasts_s), 0
-        self.missed = missed
 
     @property
     def over(self) -> bool:
@@ -142,7 +142,6 @@ def _hung(
     lasts_s: float,
     swing_m: float,
     seen: Callable[[float], bool] = lambda _: True,
-    missed: int = 0,
 ) -> list[BallDetection]:
     """The detections kept of a ball that swings; ``seen``: whether it is, at a time (s)."""
     rng = np.random.default_rng(3)
@@ -161,7 +160,7 @@ def _hung(
     rig = default_rig().cameras
     session = Session.begin(folder, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
     guide = Guide(attended=False, countdown_s=0.0)
-    return rest_ball(cast(Feed, _Looks(lasts_s, missed)), session, guide, "hanging-1800")
+    return rest_ball(cast(Feed, _Looks(lasts_s)), session, guide, "hanging-1800")
 
 
 def test_a_swinging_ball_is_averaged_over_whole_swings(
@@ -206,13 +205,6 @@ def test_a_ball_that_hangs_too_shortly_or_swings_is_not_at_rest(
     words = r"no camera sees the ball at rest for 2\.5 s: .*; a recording of it has to last 3 s"
     with pytest.raises(CalibrationError, match=words):
         _hung(tmp_path, monkeypatch, lasts_s=lasts_s, swing_m=swing_m, seen=seen)
-
-
-def test_a_ball_that_a_slow_machine_missed_is_not_said_to_move(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(CalibrationError, match="too slow for the replay: 7 frames were missed"):
-        _hung(tmp_path, monkeypatch, lasts_s=2.0, swing_m=1e-3, missed=7)
 
 
 @pytest.mark.parametrize("period_s", [1.1, 1.9, 2.7, 3.1])

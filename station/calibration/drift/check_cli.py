@@ -109,7 +109,7 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
     return [
         estimate_move(
             DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),
-            [frame.depth for frame in frames],
+            [frame.pixels() for frame in frames],
             frames[0].scale_m,
         )
         for name, frames in taken.items()

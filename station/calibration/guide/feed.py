@@ -36,8 +36,9 @@ from station.sensors.base import DeviceInfo
 from station.sensors.recording import read_raw
 
 _POLL_S = 0.05
-_LIVE_FRAMES, _REPLAYED_FRAMES = 120, 400
-"""Frames that may wait; each is 0.6 MB."""
+_WAITING = 120
+"""Frames that may wait; each is 0.6 MB. Of a replay further ones are read from disk again."""
+_NOT_HELD = np.zeros((0, 0), np.uint16)
 _STOP_S = 5.0
 _GATHER_S = 20.0
 
@@ -56,17 +57,20 @@ class TimedFrame:
     file: Path | None = None
     """The frame in its recording, where it is replayed."""
 
+    def pixels(self) -> NDArray[np.uint16]:
+        """``depth``, from its file where it is not held."""
+        if self.depth.size or self.file is None:
+            return self.depth
+        return TABLE[read_raw(self.file) & NO_READING]
+
     def depth_m(self) -> NDArray[np.float32]:
-        depth = self.depth
-        if not depth.size and self.file is not None:
-            depth = TABLE[read_raw(self.file) & NO_READING]
-        return depth.astype(np.float32) * np.float32(self.scale_m)
+        return self.pixels().astype(np.float32) * np.float32(self.scale_m)
 
     def on_disk(self) -> TimedFrame:
         """The same frame without its pixels, if these can be read again."""
         if self.file is None:
             return self
-        return replace(self, depth=np.zeros((0, 0), np.uint16))
+        return replace(self, depth=_NOT_HELD)
 
 
 class Feed:
@@ -83,9 +87,7 @@ class Feed:
         self._wishes = publisher(self._context, folder, "desired", "desired") if clocks else None
         self._intake = FrameIntake(self._context, folder, self._names)
         self._wished_s = 0.0
-        kept = _REPLAYED_FRAMES if clocks else _LIVE_FRAMES
-        self._waiting: deque[TimedFrame] = deque(maxlen=kept)
-        self._overrun = 0
+        self._waiting: deque[TimedFrame] = deque(maxlen=None if clocks else _WAITING)
 
     def __enter__(self) -> Feed:
         return self
@@ -102,11 +104,6 @@ class Feed:
     def over(self) -> bool:
         """All recordings have been seen once; live cameras never end."""
         return bool(self._clocks) and all(clock.over for clock in self._clocks.values())
-
-    @property
-    def missed(self) -> int:
-        """Frames of replayed recordings that came too fast to be taken."""
-        return self._overrun + sum(clock.missed for clock in self._clocks.values())
 
     def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
         """Every camera as it comes from the factory, once all of them give frames.
@@ -193,21 +190,22 @@ class Feed:
         """Take all that has come; wait for the first of it."""
         self._wish()
         for live in self._intake.frames(timeout_s):
-            frame = self._timed(live)
-            if frame is not None:
-                self._overrun += len(self._waiting) == self._waiting.maxlen
-                self._waiting.append(frame)
+            for frame in self._timed(live):
+                self._waiting.append(frame if len(self._waiting) < _WAITING else frame.on_disk())
 
-    def _timed(self, live: LiveFrame) -> TimedFrame | None:
-        header = live.header
+    def _timed(self, live: LiveFrame) -> list[TimedFrame]:
+        """A frame that has come; before it those of its recording that came too fast."""
+        header, scale_m = live.header, live.header.depth_scale_m
         clock = self._clocks.get(header.camera)
-        time_s = header.host_time_s if clock is None else clock.time_s(header)
-        if time_s is None:
-            return None
+        if clock is None:
+            resets = header.clock_resets
+            return [TimedFrame(header.camera, header.host_time_s, live.depth, scale_m, resets)]
         # Replays have the clocks of their recordings, whatever becomes of the replay's.
-        resets = header.clock_resets if clock is None else 0
-        file = None if clock is None else clock.file(header)
-        return TimedFrame(header.camera, time_s, live.depth, header.depth_scale_m, resets, file)
+        held = {header.device_ticks: live.depth}
+        return [
+            TimedFrame(header.camera, time_s, held.get(ticks, _NOT_HELD), scale_m, file=file)
+            for ticks, time_s, file in clock.frames(header)
+        ]
 
     def _wish(self) -> None:
         """Capture processes of a replay have no control that tells them to stream."""

@@ -44,6 +44,11 @@ class Procedure(Attempt):
     def run(self) -> None:
         """All steps that are not done yet."""
         self._check_recordings()
+        if self.recordings is not None:
+            self.guide.say(
+                "recordings are replayed; there is nothing to do, and the instructions are those "
+                "of a live booth"
+            )
         session = self.unfinished_session()
         if session is not None and session.adds_to:
             raise CalibrationError(
@@ -75,11 +80,15 @@ class Procedure(Attempt):
         self.solve()
 
     def _waved(self, session: Session) -> bool:
-        """Whether the ball was waved enough, or as long as is asked for: then a camera may lack
-        something that more of it would not show."""
+        """Whether the ball was waved enough, or as long as is asked for or recorded: then a camera
+        may lack something that more of it would not show."""
         coverage = coverage_so_far(session, self.config.reference)
-        replayed = self.recordings is not None
-        if coverage.enough or replayed or session.waved_s < self.config.calibrate.waving_s:
+        over = (
+            session.waved_s >= self.config.calibrate.waving_s
+            if self.recordings is None
+            else session.replayed
+        )
+        if coverage.enough or not over:
             return coverage.enough
         self.guide.say(
             f"the ball was waved for {session.waved_s} s; more of it would help (station "

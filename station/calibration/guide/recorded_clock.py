@@ -1,4 +1,4 @@
-"""The times of a recording's frames, whatever the speed of its replay."""
+"""The frames of a recording and their times, whatever the speed of its replay."""
 
 from __future__ import annotations
 
@@ -11,46 +11,43 @@ from station.sensors.recording import check_recording
 
 
 class RecordedClock:
-    """The original times of a recording's frames, independent of the speed of the replay.
+    """A recording's frames with their original times, independent of the speed of the replay.
 
     Four recordings are replayed by four processes that start one after the other and keep pace
-    each by itself; what the frames have in common is written in the recordings.
+    each by itself; what the frames have in common is written in the recordings. Frames that came
+    faster than a busy machine could take them are named with the next that did come.
     """
 
     def __init__(self, folder: Path) -> None:
         listed = check_recording(folder)
-        self._frames = {ticks: (index, s) for index, (s, ticks, _) in enumerate(listed)}
-        self._files = {ticks: file for _, ticks, file in listed}
-        self._last_index = -1
-        self._last = len(listed) - 1
+        self._listed = listed
+        self._index = {ticks: index for index, (_, ticks, _) in enumerate(listed)}
+        self._next = 0
         self._clock: DeviceClock | None = None
         self.over = False
         """It has been seen once; from here on it starts over."""
-        self.missed = 0
-        """Frames of it that did not come, so far."""
 
-    def file(self, header: FrameHeader) -> Path | None:
-        """The file of a frame."""
-        return self._files.get(header.device_ticks)
+    def frames(self, header: FrameHeader) -> list[tuple[int, float, Path]]:
+        """The frames up to one that has come: ticks, time at which each was taken, and file.
 
-    def time_s(self, header: FrameHeader) -> float | None:
-        """Time at which a frame was taken; None when the recording has begun anew."""
-        found = self._frames.get(header.device_ticks)
-        if found is None:
+        Without those that were named before; all that are left when the recording begins anew.
+
+        Raises:
+            CalibrationError: the recording has no such frame.
+        """
+        index = self._index.get(header.device_ticks)
+        if index is None:
             raise CalibrationError(
                 f"camera {header.camera} shows a frame that its recording does not hold; "
                 "is another station running on these recordings?"
             )
-        index, seconds = found
         if self.over:
-            return None
-        if index <= self._last_index:
-            self.missed += self._last - self._last_index
-            self.over = True
-            return None
-        self.missed += index - self._last_index - 1
+            return []
         if self._clock is None:
             self._clock = DeviceClock(header.tick_hz, 32)
-        self._last_index = index
-        self.over = index == self._last
-        return self._clock.host_time_s(header.device_ticks, seconds)
+        after = index + 1 if index >= self._next else len(self._listed)
+        new = self._listed[self._next : after]
+        self._next = after
+        self.over = after == len(self._listed)
+        host_time_s = self._clock.host_time_s
+        return [(ticks, host_time_s(ticks, seconds), file) for seconds, ticks, file in new]

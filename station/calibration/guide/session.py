@@ -43,7 +43,7 @@ JOURNAL, SCENE = "observations.jsonl", "scene"
 
 Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
-_FORGET_RAISED = "forget-raised"
+_FORGET_RAISED, _REPLAYED = "forget-raised", "ball-replayed"
 _NO_ENTRY = (
     ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
 )  # fmt: skip
@@ -58,6 +58,8 @@ class Session(Seen):
 
     folder: Path
     runs: int = 0
+    replayed: bool = False
+    """A recording of the waved ball was looked at to its end."""
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
 
@@ -134,6 +136,10 @@ class Session(Seen):
         if balls:
             self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
 
+    def end_replay(self) -> None:
+        """A recording of the waved ball was looked at to its end: it shows nothing more."""
+        self._append({"step": _REPLAYED})
+
     def forget_balls(self) -> None:
         """Wave from the beginning: another radius, a ball that slipped."""
         self._append({"step": "forget-balls"})
@@ -186,8 +192,11 @@ class Session(Seen):
         if step == "run":
             self.runs += 1
             self._later_s = None
+        elif step == _REPLAYED:
+            self.replayed = True
         elif step == "forget-balls":
             self.balls.clear()
+            self.replayed = False
         elif step == _FORGET_RAISED:
             if not isinstance(entry["places"], list):
                 raise ValueError("places are a list")

@@ -109,7 +109,7 @@ def _frames(
     """Each camera's frames (n, h, w), and their scale."""
     taken = gather_frames(feed, session.cameras, frames, guide.progress)
     return {
-        name: (np.stack([frame.depth for frame in seen]), seen[0].scale_m)
+        name: (np.stack([frame.pixels() for frame in seen]), seen[0].scale_m)
         for name, seen in taken.items()
     }
 
@@ -170,8 +170,6 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
     least_s = _SHORTEST_S if feed.replays else LOOK_S
     still = _at_rest(recent, least_s if hangs else None)
     if not still:
-        if feed.replays and feed.missed:
-            raise CalibrationError(_too_slow(feed))
         seen_s = f" for {least_s:g} s" if hangs else ""
         raise CalibrationError(
             f"no camera sees the ball at rest{seen_s}: put it where a camera sees it (one on the "
@@ -273,21 +271,14 @@ def wave_ball(
                 time.sleep(_LOOK_EVERY_S)
         finally:
             write()
-    if feed.replays and feed.missed:
-        guide.say(_too_slow(feed))
+    if feed.replays:
+        session.end_replay()
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
     if not coverage.enough:
         guide.say(f"more positions would help: {coverage.advice()}")
-
-
-def _too_slow(feed: Feed) -> str:
-    return (
-        f"this machine is too slow for the replay: {feed.missed} frames were missed; stop other "
-        "programs if the computer is busy"
-    )
 
 
 def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
