@@ -55,10 +55,15 @@ class Collection:
             return "; ".join(troubles)
         if silent:
             return f"camera {', '.join(silent)} went silent; check its cable and scan again"
-        return (
-            f"only {len(self.sets)} of {self.wanted} framesets arrived within {within_s:g} s; see "
-            "station status, then scan again"
-        )
+        return too_slow_words(len(self.sets), self.wanted, within_s)
+
+
+def too_slow_words(count: int, wanted: int, within_s: float) -> str:
+    """Cause and remedy where cameras work and too few framesets come."""
+    return (
+        f"only {count} of the {wanted} pictures of a scan came within {within_s:g} s: this "
+        "computer is too busy; stop other programs, then scan again"
+    )
 
 
 def silence_in_words(why: Mapping[str, str]) -> str:

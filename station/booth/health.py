@@ -21,6 +21,8 @@ from station.core.service import read_health
 
 MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""
+_STARTING_S = 15.0
+"""Time after the first process has started in which others may be starting still."""
 _STUCK_S = 60.0
 """Time beyond its limit after which a claimed scan counts as stuck."""
 
@@ -52,7 +54,9 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     if not reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
     hanging = {name for name in sync.get("silent", ()) if not reports(processes[f"capture {name}"])}
-    problems += _cameras(sync, hanging, wanted=bool(processes["control"].get("streaming")))
+    recorded = {camera.name for camera in config.cameras if camera.replays}
+    wanted = bool(processes["control"].get("streaming"))
+    problems += _cameras(sync, hanging, recorded, wanted=wanted)
     problems += [
         str(problem)
         for content in processes.values()
@@ -69,6 +73,15 @@ def reports(content: Mapping[str, Any]) -> bool:
     return bool(content) and content["age_s"] <= MAX_AGE_S
 
 
+def starting(processes: Mapping[str, Mapping[str, Any]]) -> set[str]:
+    """Processes that have not reported since the booth was started, seconds ago."""
+    starts_s = [content.get("started_s", 0.0) for content in processes.values() if reports(content)]
+    began_s = min(starts_s, default=0.0)
+    if time.monotonic() - began_s > _STARTING_S:
+        return set()
+    return {name for name, told in processes.items() if not told or told["told_s"] < began_s}
+
+
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
     if not any(map(reports, processes.values())):
@@ -83,15 +96,18 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         else f"the {name} process is not running; see journalctl -u 'booth-*', or the "
         "terminal of station run"
         for name, content in processes.items()
-        if not reports(content)
+        if not reports(content) and name not in starting(processes)
     ]
 
 
-def _cameras(sync: dict[str, Any], hanging: set[str], *, wanted: bool) -> list[str]:
+def _cameras(
+    sync: dict[str, Any], hanging: set[str], recorded: set[str], *, wanted: bool
+) -> list[str]:
     """Cameras whose frames are not what they should be.
 
     Args:
         hanging: cameras whose process does not report, which is told of the process.
+        recorded: cameras that play recordings.
         wanted: the operator has started the sensors.
     """
     told: dict[str, dict[str, Any]] = sync.get("cameras", {})
@@ -106,7 +122,10 @@ def _cameras(sync: dict[str, Any], hanging: set[str], *, wanted: bool) -> list[s
             detail = told[name]["detail"]
             silent[name] = f" ({detail})" if detail else ""
     if silent:
-        remedy = "check its cable" if len(silent) == 1 else "check their cables"
+        if recorded.issuperset(silent):
+            remedy = "check the recording" if len(silent) == 1 else "check the recordings"
+        else:
+            remedy = "check its cable" if len(silent) == 1 else "check their cables"
         problems.append(f"{silence_in_words(silent)}; {remedy}")
     return problems
 

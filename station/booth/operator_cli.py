@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import booth_health, reports
+from station.booth.health import booth_health, reports, starting
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -145,9 +145,13 @@ def _show_status(content: Mapping[str, Any]) -> None:
         click.echo("sensors " + ("started" if streaming else "stopped"))
     if any(content["processes"].values()):
         click.echo(f"  {'process':<22} {'state':<10} last report")
+        begun = starting(content["processes"])
         for name, told in content["processes"].items():
+            words = "running" if reports(told) else "SILENT"
             age = f"{told['age_s']:.0f} s ago" if told else "never"
-            click.echo(f"  {name:<22} {'running' if reports(told) else 'SILENT':<10} {age}")
+            if name in begun:
+                words, age = "starting", ""
+            click.echo(f"  {name:<22} {words:<10} {age}".rstrip())
     cameras = content["sync"].get("cameras", {})
     if cameras:
         click.echo(f"  {'camera':<22} {'state':<10} {'frames':>8} {'lost':>6} {'Hz':>5}")

@@ -12,7 +12,7 @@ from typing import Any
 import click
 import zmq
 
-from station.booth.collection import LATE, Collection, Order, silence_in_words
+from station.booth.collection import LATE, Collection, Order, silence_in_words, too_slow_words
 from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import LiveCloud, frameset_points, is_empty
@@ -63,6 +63,9 @@ class SyncProcess:
         self._cancelled: set[ScanId] = set()
         self._ended: deque[Ended] = deque(maxlen=_ENDED_KEPT)
         self._set_count = 0
+        self._set_times_s: deque[float] = deque(maxlen=config.scan.framesets)
+        self._silent_s = time.monotonic()
+        """Last moment at which a camera was silent."""
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._heart = Heartbeat(folder, "sync")
 
@@ -99,6 +102,7 @@ class SyncProcess:
     def _use(self, found: Frameset[LiveFrame]) -> None:
         self._set_count += 1
         now_s = time.monotonic()
+        self._set_times_s.append(now_s)
         newest_s = max(frame.header.received_s for frame in found.frames.values())
         self._latencies_s.append(now_s - newest_s)
         collection = self._collection
@@ -167,6 +171,15 @@ class SyncProcess:
             for name in self._names
             if (trouble := self._checks[name].trouble(now_s))
         ]
+
+    def _too_slow(self, now_s: float) -> str:
+        """Words on framesets that are too rare for a scan; empty if they are not."""
+        scan = self._config.scan
+        since_s = now_s - scan.max_duration_s
+        count = sum(moment_s > since_s for moment_s in self._set_times_s)
+        if count >= scan.framesets or self._silent_s > since_s or self._troubles():
+            return ""
+        return too_slow_words(count, scan.framesets, scan.max_duration_s)
 
     def _useless(self, rig: Rig, last: Frameset[LiveFrame]) -> str:
         """Reason why a scan that ended with a frameset shows no body; empty if it may show one."""
@@ -252,6 +265,8 @@ class SyncProcess:
     def _health(self) -> dict[str, Any]:
         now_s = time.monotonic()
         silent = self._silent()
+        if silent:
+            self._silent_s = now_s
         latencies = sorted(self._latencies_s)
         collection = self._collection
         return {
@@ -273,7 +288,7 @@ class SyncProcess:
             },
             "silent": silent,
             "problems": [
-                *filter(None, [self._writer.stalled(now_s)]),
+                *filter(None, [self._writer.stalled(now_s), self._too_slow(now_s)]),
                 *(self._wrong_sensors(rig) if (rig := self._live.rig) else []),
             ],
             "framesets": self._set_count,

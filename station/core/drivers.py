@@ -67,6 +67,11 @@ class CameraConfig(Strict):
     name: Name = Field(description="the camera's name in the calibration and in every message")
     driver: str = Field(description="how it is read: the name of an installed driver")
 
+    @property
+    def replays(self) -> bool:
+        """Whether it plays a recording, which no cable leads to."""
+        return getattr(self, "recording", None) is not None
+
     def replaying(self, recording: Path) -> CameraConfig:
         """The section of this camera as it plays a recording instead.
 

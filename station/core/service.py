@@ -183,7 +183,7 @@ class Heartbeat:
 
     def __init__(self, runtime_folder: Path, process: str) -> None:
         self._path = private_folder(runtime_folder / HEALTH) / f"{file_name(process)}.json"
-        self._process = process
+        self._process, self._started_s = process, time.monotonic()
         self._content: dict[str, Any] = {}
         self._beat_s = self._told_s = 0.0
         self._new = threading.Event()
@@ -219,6 +219,7 @@ class Heartbeat:
         self._content = {
             "process": self._process,
             "pid": os.getpid(),
+            "started_s": self._started_s,
             "told_s": self._told_s,
             **content,
         }

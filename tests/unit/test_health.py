@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from station.booth.health import booth_health
+from station.booth.health import MAX_AGE_S, booth_health, starting
+from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.service import HEALTH, file_name
+from station.sensors.freenect import FreenectCamera
 
 _CAMERAS = ("a", "b")
 
@@ -56,6 +60,10 @@ def test_a_silent_camera_is_named_once_the_sensors_are_started(config: BoothConf
 def test_the_remedy_of_several_silent_cameras_is_said_once(config: BoothConfig) -> None:
     cameras = {name: _camera("streaming") for name in _CAMERAS}
     found = _problems(config, streaming=True, silent=["a", "b"], cameras=cameras)
+    assert found == ["cameras a, b send no frames; check the recordings"]
+    sensors = tuple(FreenectCamera(name=name, serial=name) for name in _CAMERAS)
+    cabled = config.model_copy(update={"cameras": sensors})
+    found = _problems(cabled, streaming=True, silent=["a", "b"], cameras=cameras)
     assert found == ["cameras a, b send no frames; check their cables"]
 
 
@@ -88,3 +96,51 @@ def test_a_booth_that_was_stopped_is_told_in_one_sentence(config: BoothConfig) -
     assert problem.startswith("no process of the booth is running here; start it with: station run")
     _tell(config, "control")
     assert len(booth_health(config).problems) == 4
+
+
+def test_a_booth_that_has_just_started_is_not_said_to_hang(config: BoothConfig) -> None:
+    """Each process' last report was that of the day before."""
+    for process in ("capture a", "capture b"):
+        _tell(config, process, age_s=143.0)
+    now_s = time.monotonic()
+    _tell(config, "workers", started_s=now_s - 3.0)
+    _tell(config, "sync", started_s=now_s - 2.0)
+    assert starting(booth_health(config).processes) == {"capture a", "capture b", "control"}
+    assert booth_health(config).problems == []
+    # One that has reported since, and no more, hangs.
+    _tell(config, "capture a", age_s=2.9 + MAX_AGE_S - 3.0, started_s=now_s - 3.0)
+    _tell(config, "workers", started_s=now_s - 60.0)
+    problems = booth_health(config).problems
+    assert any("the capture b process has not reported for 143 s" in told for told in problems)
+
+
+def test_a_recording_that_gives_nothing_is_not_sent_to_its_cable(config: BoothConfig) -> None:
+    cameras = {"a": _camera("lost", "0.pgm is torn; record again"), "b": _camera("streaming")}
+    (problem,) = _problems(config, streaming=True, silent=["a"], cameras=cameras)
+    assert problem == "camera a sends no frames (0.pgm is torn; record again); check the recording"
+
+
+@pytest.mark.parametrize(
+    ("sets", "apart_s", "quiet_s", "told"),
+    [
+        (10, 0.25, 60.0, False),
+        (10, 0.4, 60.0, True),
+        (3, 0.1, 60.0, True),
+        # A camera was silent a moment ago: framesets have only begun.
+        (3, 0.1, 1.0, False),
+    ],
+)
+def test_framesets_that_are_too_rare_for_a_scan_are_told(
+    config: BoothConfig, sets: int, apart_s: float, quiet_s: float, *, told: bool
+) -> None:
+    """Scans failed for it, and status said that all was well."""
+    sync = SyncProcess(config, logging.getLogger("sync"))
+    try:
+        sync._silent_s = 100.0 - quiet_s
+        sync._set_times_s.extend(100.0 - apart_s * np.arange(sets)[::-1])
+        words = sync._too_slow(100.0)
+        assert bool(words) == told
+        assert not told or "pictures of a scan came within 3 s: this computer is too busy" in words
+    finally:
+        sync._writer.close()
+        sync._context.destroy(linger=0)
