@@ -44,6 +44,9 @@ _WORDS = {
 def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) -> None:
     """List the scans of this booth, newest first, with their outcome.
 
+    Scans that were not taken (nobody in the booth, a silent camera) are not listed: of them there
+    is nothing but the reason that was told. Times are UTC.
+
     \b
     Examples:
       station list

@@ -99,6 +99,8 @@ def record_virtual(
     """
     if hanging and waving_s is None:
         raise InputError("--hanging is of a calibration: give --calibration SECONDS too")
+    if body is not None:
+        load_mesh(body)
     writable_folder(out_folder, "--out")
     bias_m = 0.0 if waving_s is None else _UNIT_BIAS_M
     booth = SimulatedBooth(seed=seed, bias_m=bias_m, clutter=fixed_posts())

@@ -49,6 +49,8 @@ def load_mesh(path: Path) -> Mesh:
     Raises:
         InputError: naming the file and what is wrong with it.
     """
+    if not path.is_file():
+        raise InputError(f"{path} is not a file; give a mesh: .npz, .ply or .obj")
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as archive:

@@ -100,9 +100,9 @@ def test_its_section_is_checked_by_its_own_class(config_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("wall_m", "wall_mm"), "cameras.0.wall_m is missing"),
+        (("wall_m", "wall_mm"), "cameras[1].wall_m is missing"),
         (('"a"', '"a"\ncolour = 1'), "allowed here: name, driver, wall_m, table"),
-        (("1.5", "-1.5"), "cameras.0.wall_m: must be greater than 0"),
+        (("1.5", "-1.5"), "cameras[1].wall_m: must be greater than 0"),
         (('"pretend"', '"broken"'), "the driver broken (pretend_sensor:Missing) cannot be loaded"),
         (('"pretend"', '"other"'), "installed: broken, "),
     ],

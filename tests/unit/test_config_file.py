@@ -58,7 +58,7 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         (_CAMERA + "[volume]\nmin_m = 3", "volume.min_m: must be a list in brackets (found 3)"),
         (_CAMERA + "[volume]\nmin_m = [1, 2, 3, 4]", "min_m: must have at most 3 values (found [1"),
         (_CAMERA + "[deliver]\nname = 'o'", "deliver: there can be several; write [[deliver]]"),
-        (_CAMERA + "colour = true", "unknown key cameras.0.colour; allowed here: name, driver"),
+        (_CAMERA + "colour = true", "unknown key cameras[1].colour; allowed here: name, driver"),
         (_CAMERA + "[sync]\ntolerence_s = 1", "unknown key sync.tolerence_s; allowed here: tol"),
         (_CAMERA + "[sync]\ntolerance_s = -1", "sync.tolerance_s: must be greater than 0"),
         (_CAMERA + "[sync]\ntolerance_s = nan", "sync.tolerance_s"),
@@ -74,7 +74,7 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
             _CAMERA.replace('"recorded"', '"kinect9"'),
             "no driver 'kinect9'; installed: freenect, recorded, virtual",
         ),
-        (_CAMERA.replace("recording =", "serial ="), "cameras.0.recording is missing"),
+        (_CAMERA.replace("recording =", "serial ="), "cameras[1].recording is missing"),
         ("version = 2\n" + _CAMERA, "version"),
     ],
 )

@@ -68,6 +68,8 @@ def fit(
         raise click.UsageError("give either a bundle or --cloud FILE")
     if bundle is not None and bundle.suffix.lower() in (".ply", ".pcd"):
         raise click.UsageError(f"{bundle} is no scan bundle; for a point cloud: --cloud {bundle}")
+    if not (bundle or cloud or out_folder).exists():
+        raise InputError(f"{bundle or cloud} does not exist")
     _check_folders(out_folder, debug_folder)
     from workers.cloud.cloud_file import read_cloud
     from workers.reconstruct import job

@@ -65,10 +65,14 @@ def _of_result(folder: Path, pose: str) -> dict[str, Any]:
     name = "measurements.json" if pose == "as-scanned" else "measurements-standard.json"
     path = folder / name
     if not path.exists() and not path.is_symlink():
-        raise InputError(
-            f"{folder} has no {name}; give a result folder, or measure its mesh: "
-            f"reconstruct measure {folder / 'mesh.ply'} --pose {pose}"
-        )
+        mesh = folder / "mesh.ply"
+        if (folder / "bundle.json").exists():
+            remedy = f"it is a scan bundle: reconstruct fit {folder} --out result"
+        elif mesh.exists():
+            remedy = f"measure its mesh: reconstruct measure {mesh} --pose {pose}"
+        else:
+            remedy = "give the folder of a result"
+        raise InputError(f"{folder} has no {name}; {remedy}")
     document = read_json(path, format="booth-measurements", versions=[1])
     try:
         _Document.model_validate_json(json.dumps(document), strict=True)
