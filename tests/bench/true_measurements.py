@@ -93,7 +93,7 @@ class TrueBody:
     def _points(self, point: Array, normal: Array, kind: Section) -> Array:
         segments = self._segments(point, normal, kind.parts)
         if not kind.whole:
-            segments = _nearest_chain(segments, point)
+            segments = _own_chain(segments, point, normal)
         return segments.reshape(-1, 3)
 
     def _thickest(self, plane: Thickest, kind: Section) -> float:
@@ -109,11 +109,10 @@ class TrueBody:
         side /= np.sqrt(side @ side)
         upright = np.array([0.0, 0.0, 1.0]) - side[2] * side
         normal = so3_exp(tilt * side) @ (upright / np.sqrt(upright @ upright))
-        middle = (at[plane.front] + at[plane.back])[None] / 2.0
+        middle = (at[plane.front] + at[plane.back]) / 2.0
         for chain in _chains(self._segments(at[plane.front], normal, parts)):
-            reach, inner = (_reach(points, normal) for points in (chain.reshape(-1, 3), middle))
-            if (inner <= reach.max(axis=0)).all() and (inner >= reach.min(axis=0)).all():
-                return float(np.pi * np.ptp(reach, axis=0).mean())
+            if _goes_around(chain, normal, middle):
+                return _tape_around(chain.reshape(-1, 3), normal)
         return None
 
     def _plane(self, plane: Plane) -> tuple[Array, Array]:
@@ -242,13 +241,23 @@ def _reach(points: Array, normal: Array) -> Array:
     return np.asarray(found)
 
 
-def _nearest_chain(segments: Array, point: Array) -> Array:
-    """The segments that hang together with the one nearest to a point."""
+def _own_chain(segments: Array, point: Array, normal: Array) -> Array:
+    """The segments that hang together around a point, else with the one nearest to it."""
 
     def away(chain: Array) -> float:
         return float(np.linalg.norm(chain.mean(axis=1) - point, axis=1).min())
 
-    return min(_chains(segments), key=away)
+    chains = _chains(segments)
+    around = [chain for chain in chains if _goes_around(chain, normal, point)]
+    if around:
+        return max(around, key=lambda chain: _tape_around(chain.reshape(-1, 3), normal))
+    return min(chains, key=away)
+
+
+def _goes_around(chain: Array, normal: Array, point: Array) -> bool:
+    """Whether segments (n, 2, 3) of a plane reach as far as a point in every direction."""
+    reach, inner = (_reach(points, normal) for points in (chain.reshape(-1, 3), point[None]))
+    return bool(((inner <= reach.max(axis=0)) & (inner >= reach.min(axis=0))).all())
 
 
 def _chains(segments: Array) -> list[Array]:

@@ -162,9 +162,10 @@ class Section:
     """Girth of the section of some parts with a plane, or its breadth or depth.
 
     A tape spans hollows, so its line is the convex hull of the section. Of a section in several
-    pieces, `whole` takes all (a trunk with both thighs); otherwise the piece nearest to the plane's
-    landmarks counts (one thigh of two). Breadth is measured along the line of the two landmarks
-    `across`, projected to the plane, and depth perpendicular to it.
+    pieces, `whole` takes all (a trunk with both thighs); otherwise the piece counts that goes
+    around the plane's point (the palm, not a finger that is curled before it), and if none does,
+    the one nearest to it (one thigh of two). Breadth is measured along the line of the two
+    landmarks `across`, projected to the plane, and depth perpendicular to it.
     """
 
     plane: Plane | Narrowest | Thickest
