@@ -42,9 +42,9 @@ _MET, _UNSEEN = np.array([225.0, 235.0, 225.0]), np.array([150.0, 150.0, 150.0])
 _CLOSE_M = 0.01
 _BARE_DARK, _BARE_LIGHT = 60.0, 200.0
 _BODY_EVENTS = {
-    "start": (2, "start"),
-    "joint": (4, "model fitted (pose and shape)"),
-    "done": (6, "result"),
+    "start": (2, "start; points of the scan over it"),
+    "joint": (4, "model fitted (pose and shape); points of the scan over it"),
+    "done": (6, "result; points of the scan over it"),
 }
 """Stages that are drawn as the body with the cloud over it: number and title."""
 
@@ -82,6 +82,7 @@ class DebugPictures:
         away = np.linalg.norm(on_cloud - on_body, axis=1)
         middle_mm = 1e3 * float(np.median(away)) if len(away) else float("nan")
         title = f"round {self._rounds}: {len(away):,} pairs, median {middle_mm:.1f} mm"
+        title += "; green: near, red: far"
         name = f"3-correspondences-{self._rounds:02d}"
         self._write(name, title, lambda frame: _paired(scene, on_body, on_cloud, frame))
 

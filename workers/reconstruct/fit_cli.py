@@ -114,6 +114,7 @@ def fit(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     click.echo(f"{out_folder}: {summary.status}")
+    click.echo(f"  its table: reconstruct measure {out_folder}", err=True)
     for reason in summary.reasons:
         click.echo(f"  {reason}")
 

@@ -44,6 +44,9 @@ def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> No
     A mesh (metres, soles on the floor) needs no fit; it counts as exact, so its intervals have no
     width.
 
+    CSV: lines of the verdict and of the scan first, with text in the column "value"; then the rows,
+    left minus right, volume and surface. Blank values are rows that could not be measured.
+
     \b
     Examples:
       reconstruct measure spool/outbox/20261121T100000Z-7f3a

@@ -189,7 +189,7 @@ def fit_overlapping(
     reference, evidence = None, None
     if method == "paper":
         surface, state, iterations = fit_like_the_paper(
-            model, target, starts[0], lambda share: progress("icp", share), observer
+            model, target, starts[0], lambda share: progress("fitting", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
         cameras = CameraCorrections.build(cloud, scan.views)
@@ -341,7 +341,7 @@ def _best_start(
 
 
 def _report(progress: Progress, before: float, share: float, of_schedule: float) -> None:
-    progress("icp", before + share * of_schedule)
+    progress("fitting", before + share * of_schedule)
 
 
 def _check(cloud: PointCloud) -> None:
