@@ -8,6 +8,7 @@ import pytest
 
 from station.core.geometry import rigid, so3_exp, transform
 from station.core.lens import rays
+from station.core.rig import PredictedError
 from station.simulation.scene import (
     Mesh,
     VirtualScene,
@@ -148,6 +149,27 @@ def test_a_corrected_camera_stands_where_its_points_are_moved_to(
     )
     pose = corrections.poses([view])[0]
     assert np.allclose(transform(pose, local), corrections.apply(points, camera), atol=1e-9)
+
+
+def test_cameras_are_believed_as_the_calibrations_cloud_is(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    """Poses that are known to 3 mm released cameras whose cloud was known to 0.1 mm."""
+    view = _view(model, body)
+    calibrated = replace(view.calibration, covariance=np.diag([1.4e-3] * 3 + [3e-3] * 3) ** 2)
+    known = replace(view, calibration=calibrated)
+    points = np.zeros((1, 3))
+    cloud = PointCloud(points, points, np.ones(1), np.zeros(1, np.int16), ("front-upper",))
+
+    def sigma_m(view: CameraView, predicted: PredictedError | None) -> float:
+        information = CameraCorrections.build(cloud, [view], predicted).information[0]
+        return float(np.sqrt(np.linalg.inv(information)[5, 5]))
+
+    alone = sigma_m(view, None)
+    said = PredictedError(1e-3, 5e-4, 1e-4, 1e-3)
+    assert sigma_m(known, said) < 1.1 * alone
+    assert sigma_m(known, replace(said, normal_rms_m=2e-3)) == pytest.approx(2e-3, rel=0.05)
+    assert sigma_m(known, None) == pytest.approx(3e-3, rel=0.05)
 
 
 def test_shifts_are_those_of_the_middle_of_each_cameras_points(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.geometry import rigid, so3_exp
-from station.core.rig import CameraCalibration
+from station.core.rig import CameraCalibration, PredictedError
 from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.model.kernels import transform_groups
 
@@ -24,7 +24,7 @@ Index = NDArray[np.integer]
 
 _TURN_SIGMA_RAD = np.radians(0.015)
 _SHIFT_SIGMA_M = 0.0003
-"""Standard deviations of the prior; the calibration's own covariance is added."""
+"""Standard deviations of the prior where the calibration's cloud is exact."""
 _FREEDOM = 0.5
 """Degrees of freedom of the prior, a Student t distribution: its heavy tails release a single
 camera that was knocked."""
@@ -42,18 +42,32 @@ class CameraCorrections:
     """(C, 6): omega in radians, tau in metres."""
 
     @classmethod
-    def build(cls, cloud: PointCloud, views: Sequence[CameraView]) -> CameraCorrections:
-        """Zero corrections; none for a bare cloud, which has no cameras."""
+    def build(
+        cls,
+        cloud: PointCloud,
+        views: Sequence[CameraView],
+        predicted: PredictedError | None = None,
+    ) -> CameraCorrections:
+        """Zero corrections; none for a bare cloud, which has no cameras.
+
+        Args:
+            predicted: the calibration's statement of its cloud's error, by which the prior grows.
+                Without it the covariances of the poses are added. These contain what the depth
+                corrections make up for, and what moves all cameras together: poses that are known
+                to 3 mm have clouds that are known to 0.1 mm.
+        """
         by_name = {view.name: view.calibration for view in views}
         if not by_name:
             return cls(np.empty((0, 3)), np.empty((0, 6, 6)), np.empty((0, 6)))
         assert tuple(by_name) == cloud.camera_names, "views in the order of the cloud's cameras"
         believed = np.diag([_TURN_SIGMA_RAD**2] * 3 + [_SHIFT_SIGMA_M**2] * 3)
+        if predicted is not None:
+            believed *= 1.0 + (predicted.normal_rms_m / _SHIFT_SIGMA_M) ** 2
         eyes, information = [], []
         for name in cloud.camera_names:
             camera = by_name[name]
             covariance = believed.copy()
-            if camera.covariance is not None:
+            if predicted is None and camera.covariance is not None:
                 turn = np.kron(np.eye(2), camera.world_from_camera[:3, :3])
                 covariance += turn @ camera.covariance @ turn.T
             eyes.append(camera.world_from_camera[:3, 3])

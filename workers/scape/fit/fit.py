@@ -17,7 +17,6 @@ from station.core.errors import InputError
 from workers.cloud.observed import (
     MIN_POINTS,
     POSSIBLE_HEIGHTS_M,
-    CameraView,
     Finding,
     PointCloud,
     Preprocessed,
@@ -192,10 +191,10 @@ def fit_overlapping(
             model, target, starts[0], lambda share: progress("fitting", share), observer
         )
         used = int(np.isfinite(surface.residual_m).sum())
-        cameras = CameraCorrections.build(cloud, scan.views)
+        cameras = CameraCorrections.build(cloud, scan.views, scan.predicted)
         fitted = time.monotonic()
     else:
-        joint = _best_start(model, sampling, cloud, scan.views, target, starts, progress, observer)
+        joint = _best_start(model, sampling, scan, target, starts, progress, observer)
         state, used, iterations = joint.state, joint.correspondences, joint.iterations
         cameras, reference, evidence = joint.cameras, joint.vertices, joint.evidence
         observer("joint", {"vertices": reference})
@@ -284,8 +283,7 @@ def _rounded(vertices: Array) -> Array:
 def _best_start(
     model: BodyModel,
     sampling: Sampling,
-    cloud: PointCloud,
-    views: Sequence[CameraView],
+    scan: Preprocessed,
     target: Target,
     starts: Sequence[BodyState],
     progress: Progress,
@@ -297,7 +295,8 @@ def _best_start(
     of skin that cameras saw through: a body with its arms up explains one whose arm was not seen.
     """
     best, hidden, least, first = None, None, np.inf, starts[0]
-    cameras = CameraCorrections.build(cloud, views)
+    cloud, views = scan.cloud, scan.views
+    cameras = CameraCorrections.build(cloud, views, scan.predicted)
     for start in starts[:_MAX_STARTS]:
         coarse = fit_jointly(model, sampling, target, start, cameras, COARSE, observer=observer)
         looked = started(is_head_hidden, model, coarse.vertices, cloud.points)
