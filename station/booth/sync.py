@@ -25,6 +25,7 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
+from station.core.kinect_v1 import FRAME_RATE_HZ
 from station.core.rig import Rig
 from station.core.scans import ScanId, scan_id_of
 from station.core.service import Heartbeat, only_process, stop_event
@@ -34,6 +35,8 @@ from station.messaging.transport import publisher, server
 
 _POLL_MS = 20
 _LATENCIES_KEPT = 2000
+_FLOWING_S = 0.2
+"""Age of a camera's last frame up to which its frames flow."""
 _ENDED_KEPT = 100
 
 
@@ -177,8 +180,13 @@ class SyncProcess:
         scan = self._config.scan
         since_s = now_s - scan.max_duration_s
         count = sum(moment_s > since_s for moment_s in self._set_times_s)
-        if count >= scan.framesets or self._silent_s > since_s or self._troubles():
+        # A camera that has just been stopped or unplugged is no sign of a busy computer.
+        stopped = self._silent_s > since_s or self._intake.silent(_FLOWING_S)
+        if count >= scan.framesets or stopped or self._troubles():
             return ""
+        needed_s = scan.framesets / FRAME_RATE_HZ
+        if needed_s > scan.max_duration_s:
+            return f"{scan.framesets} pictures take {needed_s:.1f} s, longer than max_duration_s"
         return too_slow_words(count, scan.framesets, scan.max_duration_s)
 
     def _useless(self, rig: Rig, last: Frameset[LiveFrame]) -> str:

@@ -123,9 +123,10 @@ def _validated(model: type[Section], document: Any, place: _Place, base: Any) ->
 
 def _key(place: _Place) -> str:
     """A key as it is written in TOML; of several sections by the number of its own, from 1."""
-    return ".".join(f"[{part + 1}]" if isinstance(part, int) else part for part in place).replace(
-        ".[", "["
-    )
+    key = ""
+    for part in place:
+        key += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if key else part
+    return key
 
 
 def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -> str:

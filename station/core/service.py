@@ -246,9 +246,10 @@ def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
         content = read_bounded_json(path, _MAX_HEALTH_BYTES)
         # Monotonic times of an earlier boot mean nothing.
         age_s = time.monotonic() - float(content["told_s"])
+        started_s = float(content.get("started_s", 0.0))
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-    return {**content, "age_s": age_s} if age_s >= 0.0 else {}
+    return {**content, "started_s": started_s, "age_s": age_s} if age_s >= 0.0 else {}
 
 
 def die_with_parent(parent: int) -> None:

@@ -12,15 +12,17 @@ from typing import cast
 import click
 import pytest
 
-from station.calibration.detect.step_names import EMPTY
+from station.calibration.detect.step_names import BALL, EMPTY
 from station.calibration.guide import attempt, procedure, raised_ball
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.raised_ball import see_all_heights, see_height
+from station.calibration.guide.recordings import fingerprint
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
+from station.sensors.recording import INDEX
 from station.simulation.scene import default_rig
 
 COUNTDOWN_S = 8.0
@@ -375,3 +377,19 @@ def test_all_recorded_places_of_the_board_are_used(
     unattended = Guide(attended=False, countdown_s=COUNTDOWN_S)
     Procedure(begun.config, begun.store, tmp_path, unattended).walls(asked=True)
     assert looked == [f"wall-{place}" for place in range(5)]
+
+
+def test_a_recording_of_the_ball_is_looked_at_once(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path
+) -> None:
+    """One that shows too little was looked at again each time; another one shows something else."""
+    begun, session, _ = guided
+    recording = tmp_path / "recordings" / BALL / "front-lower"
+    recording.mkdir(parents=True)
+    (recording / INDEX).write_text("d-1.0-1-0.pgm\n")
+    replayed = replace(begun, recordings=tmp_path / "recordings")
+    assert not replayed._waved(session)
+    session.end_replay(fingerprint(tmp_path / "recordings" / BALL))
+    assert replayed._waved(session)
+    (recording / INDEX).write_text("d-2.0-2-0.pgm\n")
+    assert not replayed._waved(session)

@@ -121,22 +121,25 @@ def test_a_recording_that_gives_nothing_is_not_sent_to_its_cable(config: BoothCo
 
 
 @pytest.mark.parametrize(
-    ("sets", "apart_s", "quiet_s", "told"),
+    ("sets", "apart_s", "quiet_s", "flows_s", "told"),
     [
-        (10, 0.25, 60.0, False),
-        (10, 0.4, 60.0, True),
-        (3, 0.1, 60.0, True),
+        (10, 0.25, 60.0, 60.0, False),
+        (10, 0.4, 60.0, 60.0, True),
+        (3, 0.1, 60.0, 60.0, True),
         # A camera was silent a moment ago: framesets have only begun.
-        (3, 0.1, 1.0, False),
+        (3, 0.1, 1.0, 60.0, False),
+        # The sensors have just been stopped.
+        (3, 0.1, 60.0, -1.0, False),
     ],
 )
 def test_framesets_that_are_too_rare_for_a_scan_are_told(
-    config: BoothConfig, sets: int, apart_s: float, quiet_s: float, *, told: bool
+    config: BoothConfig, sets: int, apart_s: float, quiet_s: float, flows_s: float, *, told: bool
 ) -> None:
     """Scans failed for it, and status said that all was well."""
     sync = SyncProcess(config, logging.getLogger("sync"))
     try:
         sync._silent_s = 100.0 - quiet_s
+        sync._intake.last_frame_s.update(dict.fromkeys(_CAMERAS, time.monotonic() + flows_s))
         sync._set_times_s.extend(100.0 - apart_s * np.arange(sets)[::-1])
         words = sync._too_slow(100.0)
         assert bool(words) == told

@@ -16,6 +16,7 @@ from station.calibration.detect.step_names import (
 )
 from station.calibration.guide.attempt import Attempt
 from station.calibration.guide.raised_ball import see_all_heights
+from station.calibration.guide.recordings import fingerprint, step_folder
 from station.calibration.guide.session import Session
 from station.calibration.guide.steps import (
     EMPTY_FIRST,
@@ -86,7 +87,7 @@ class Procedure(Attempt):
         over = (
             session.waved_s >= self.config.calibrate.waving_s
             if self.recordings is None
-            else session.replayed
+            else session.replayed == fingerprint(step_folder(self.recordings, BALL))
         )
         if coverage.enough or not over:
             return coverage.enough
@@ -135,6 +136,8 @@ class Procedure(Attempt):
                 session.forget_balls()
             reference, lasts_s = self.config.reference, wanted.waving_s
             wave_ball(feed, session, self.guide, reference=reference, lasts_s=lasts_s)
+            if self.recordings is not None:
+                session.end_replay(fingerprint(step_folder(self.recordings, BALL)))
         if len(session.balls) > _SURE_OF_RADIUS:
             from station.calibration.solve.refusals import check_radius
 

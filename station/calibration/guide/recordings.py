@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from station.calibration.detect.step_names import (
@@ -13,6 +14,7 @@ from station.calibration.detect.step_names import (
     raised_step,
 )
 from station.core.errors import CalibrationError
+from station.sensors.recording import INDEX
 
 
 def check_folder(recordings: Path) -> None:
@@ -49,6 +51,12 @@ def step_folder(recordings: Path, step: str) -> Path:
     deeper = _folders_with(recordings, step)
     hint = f" ({deeper[0]} does)" if deeper else ""
     raise CalibrationError(f"{missing}; it holds {known}{hint}")
+
+
+def fingerprint(folder: Path) -> str:
+    """A text that differs between recordings of a step: a digest of their lists of frames."""
+    lists = sorted(folder.glob(f"*/{INDEX}"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in lists)).hexdigest()[:16]
 
 
 def _folders_with(recordings: Path, step: str) -> list[Path]:

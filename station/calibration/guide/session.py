@@ -58,8 +58,8 @@ class Session(Seen):
 
     folder: Path
     runs: int = 0
-    replayed: bool = False
-    """A recording of the waved ball was looked at to its end."""
+    replayed: str = ""
+    """Fingerprint of the recording of the waved ball that was looked at to its end."""
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
 
@@ -136,9 +136,10 @@ class Session(Seen):
         if balls:
             self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
 
-    def end_replay(self) -> None:
-        """A recording of the waved ball was looked at to its end: it shows nothing more."""
-        self._append({"step": _REPLAYED})
+    def end_replay(self, recording: str) -> None:
+        """A recording (its fingerprint) of the waved ball was looked at to its end: it shows
+        nothing more."""
+        self._append({"step": _REPLAYED, "recording": recording})
 
     def forget_balls(self) -> None:
         """Wave from the beginning: another radius, a ball that slipped."""
@@ -192,11 +193,12 @@ class Session(Seen):
         if step == "run":
             self.runs += 1
             self._later_s = None
+            self.replayed = ""
         elif step == _REPLAYED:
-            self.replayed = True
+            self.replayed = str(entry["recording"])
         elif step == "forget-balls":
             self.balls.clear()
-            self.replayed = False
+            self.replayed = ""
         elif step == _FORGET_RAISED:
             if not isinstance(entry["places"], list):
                 raise ValueError("places are a list")

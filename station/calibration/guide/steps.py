@@ -44,9 +44,14 @@ _MANY_WAIT = 60
 _OFTEN = 0.9
 _MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
 """An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
-_BOARD_PARTS, _BOARD_MOVED_PER_M, _BOARD_MOVED_SHARE = 5, 0.004, 0.1
+_SEES_SOMETHING = 0.02
+"""Share of an image with steady readings below which a camera is covered."""
+_BOARD_PARTS, _BOARD_MOVED_PER_M, _BOARD_MOVED_SHARE = 5, 0.004, 0.25
 """A board more of which differs by more than that between any two parts of the time, 1/m, is not
 standing: 12 mm at 1.7 m, 25 at 2.5."""
+_BOARD_OFFSETS_PX = np.array([-4, 0, 4])
+"""Around the middle of a cell: nine readings that err independently. With one, before a sensor of
+twice the noise, up to a third of a standing board seemed to move."""
 
 
 def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
@@ -117,7 +122,7 @@ def _frames(
 def _check_stillness(name: str, stack: NDArray[np.uint16], scale_m: float) -> None:
     before, after = (static_view(iter(half), scale_m) for half in np.array_split(stack, 2))
     both = (before.share > _OFTEN) & (after.share > _OFTEN)
-    if not both.any():
+    if both.mean() < _SEES_SOMETHING:
         raise CalibrationError(
             f"camera {name} sees nothing: take away what covers it and do it again"
         )
@@ -132,9 +137,11 @@ def _check_stillness(name: str, stack: NDArray[np.uint16], scale_m: float) -> No
 def _check_board_stands(board: PlaneObservation, stack: NDArray[np.uint16], scale_m: float) -> None:
     """Compare the middles of the board's cells over time: it may have moved, and come back."""
     column, row = np.rint(board.patches[:, :2]).astype(int).T
+    rows = (row + _BOARD_OFFSETS_PX[:, None, None]).clip(0, stack.shape[1] - 1)
+    columns = (column + _BOARD_OFFSETS_PX[:, None]).clip(0, stack.shape[2] - 1)
     parts = []
     for part in np.array_split(stack, _BOARD_PARTS):
-        inverse = inverse_depth(scale_m * part[:, row, column])
+        inverse = inverse_depth(scale_m * part[:, rows, columns]).reshape(-1, len(row))
         count = (inverse > 0.0).sum(axis=0)
         parts.append(np.where(count > 0, inverse.sum(axis=0) / np.maximum(count, 1), np.nan))
     change = np.fmax.reduce(parts) - np.fmin.reduce(parts)
@@ -271,8 +278,6 @@ def wave_ball(
                 time.sleep(_LOOK_EVERY_S)
         finally:
             write()
-    if feed.replays:
-        session.end_replay()
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
