@@ -11,6 +11,9 @@ import numpy as np
 import open3d as o3d
 from running_station import Station
 
+from station.core.config_file import load_config
+from station.core.service import read_health
+
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
 
 
@@ -111,11 +114,13 @@ def test_sync_killed_in_a_scan_is_reported_as_failed(make_station: Callable[...,
     import threading
 
     def kill_sync() -> None:
+        folder = load_config(station.config).runtime.folder
+        station.wait_until(lambda: bool(read_health(folder, "sync").get("collecting")), "it scans")
         os.kill(station.pids("sync")[0], signal.SIGKILL)
 
-    timer = threading.Timer(1.5, kill_sync)
-    timer.start()
+    killing = threading.Thread(target=kill_sync)
+    killing.start()
     done = station.command("scan")
-    timer.join()
+    killing.join()
     assert done.returncode == 1
     assert "failed" in done.stderr

@@ -82,5 +82,5 @@ def test_folders_that_cannot_be_made_are_refused_before_the_work(tmp_path: Path)
         options = {"--out": tmp_path / "out", option: tmp_path / place}
         listed = [str(word) for pair in options.items() for word in pair]
         with pytest.raises(InputError, match=f"{words}.*{option}"):
-            CliRunner().invoke(fit, ["bundle", *listed], catch_exceptions=False)
+            CliRunner().invoke(fit, [str(tmp_path), *listed], catch_exceptions=False)
     assert not (tmp_path / "out").exists()

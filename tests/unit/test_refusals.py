@@ -138,10 +138,10 @@ REFUSED: dict[str, Callable[[], object]] = {
         refusals.check_held_out, {NAMES[0]: HeldOut(100, 2e-3, np.array([0.01, 0.0, 0.0]))}
     ),
     "heights could be wrong by up to 9.8 mm, but the limit is 6 mm": partial(
-        refusals.check_predicted, predicted(5e-3, 1e-3), LIMITS, coverage(0), 0, False
+        refusals.check_predicted, predicted(5e-3, 1e-3), LIMITS, coverage(0), (), False
     ),
     "girths could be wrong by up to 9.8 mm, but the limit is 8 mm": partial(
-        refusals.check_predicted, predicted(1e-3, 5e-3), LIMITS, coverage(0), 0, False
+        refusals.check_predicted, predicted(1e-3, 5e-3), LIMITS, coverage(0), (), False
     ),
     "the floor's slope is only known to within 0.29 degrees: lay the ball to the left": partial(
         resting_ball.check_slope, places(), world(slope_sigma_rad=5e-3)
@@ -224,7 +224,7 @@ def test_what_is_sound_passes() -> None:
     refusals.check_scatter(state())
     refusals.check_converged(state())
     refusals.check_held_out({NAMES[0]: HeldOut(100, 2e-3, np.zeros(3))})
-    refusals.check_predicted(predicted(1e-3, 1e-3), LIMITS, coverage(0), 0, False)
+    refusals.check_predicted(predicted(1e-3, 1e-3), LIMITS, coverage(0), (), False)
     resting_ball.check_slope(places(), world())
     refusals.check_upright(world())
     resting_ball.check_mark(world(), RADIUS_M)
