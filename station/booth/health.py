@@ -89,6 +89,7 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
             "no process of the booth is running here; start it with: station run, or an installed "
             "booth with: sudo systemctl start booth.target"
         ]
+    begun = starting(processes)
     return [
         f"the {name} process has not reported for {content['age_s']:.0f} s; it is restarted "
         "automatically under station run or systemd"
@@ -96,7 +97,7 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
         else f"the {name} process is not running; see journalctl -u 'booth-*', or the "
         "terminal of station run"
         for name, content in processes.items()
-        if not reports(content) and name not in starting(processes)
+        if not reports(content) and name not in begun
     ]
 
 

@@ -134,6 +134,23 @@ def _unit(vector: Array) -> Array:
     return np.asarray(vector / length)
 
 
+def _tapes_around(
+    found: EdgePoints, places: Array, piece: Index, normal: Array, middle: Array
+) -> list[_Tape]:
+    """Tapes around those pieces of a section that go around a place."""
+    tapes = []
+    for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
+        if len(chosen) < _MIN_LOOP:
+            continue
+        try:
+            tape = chosen[hull_order(places[chosen], normal)]
+        except ValueError:
+            continue  # all on a line
+        if encloses(places[tape], normal, middle):
+            tapes.append(_Tape(found.take(tape), places[tape], normal))
+    return tapes
+
+
 class _Tracer:
     def __init__(self, model: BodyModel, vertices: Array) -> None:
         self._model = model
@@ -227,11 +244,14 @@ class _Tracer:
         up /= np.linalg.norm(up)
         front = self._at(plane.front)
         middle = 0.5 * (front + self._at(plane.back))
+        net = _net(self._model, section.parts)
         most_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
         tapes: list[tuple[float, float, _Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
-            for tape in self._around(section, front, normal, middle):
+            found, crossing = net.cut(self._vertices, front, normal)
+            places = found.on(self._vertices)
+            for tape in _tapes_around(found, places, net.pieces(crossing), normal, middle):
                 girth_m = loop_length(tape.places, closed=True)
                 if girth_m < most_m:
                     tapes.append((girth_m, tilt, tape))
@@ -268,30 +288,13 @@ class _Tracer:
                     self._cuts[key] = self._tape(section, *self._plane(plane))
         return self._cuts[key]
 
-    def _around(self, section: Section, point: Array, normal: Array, middle: Array) -> list[_Tape]:
-        """Tapes around those pieces of a section that go around a place."""
-        net = _net(self._model, section.parts)
-        found, crossing = net.cut(self._vertices, point, normal)
-        places, piece = found.on(self._vertices), net.pieces(crossing)
-        tapes = []
-        for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
-            if len(chosen) < _MIN_LOOP:
-                continue
-            try:
-                tape = chosen[hull_order(places[chosen], normal)]
-            except ValueError:
-                continue  # all on a line
-            if encloses(places[tape], normal, middle):
-                tapes.append(_Tape(found.take(tape), places[tape], normal))
-        return tapes
-
     def _tape(self, section: Section, point: Array, normal: Array) -> _Tape:
         net = _net(self._model, section.parts)
         found, crossing = net.cut(self._vertices, point, normal)
         places = found.on(self._vertices)
         if not section.whole and len(places):
             piece = net.pieces(crossing)
-            if np.ptp(piece) and (tapes := self._around(section, point, normal, point)):
+            if np.ptp(piece) and (tapes := _tapes_around(found, places, piece, normal, point)):
                 return max(tapes, key=lambda tape: loop_length(tape.places, closed=True))
             wanted = piece[np.argmin(np.linalg.norm(places - point, axis=1))]
             chosen = np.flatnonzero(piece == wanted)

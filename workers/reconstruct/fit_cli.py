@@ -68,8 +68,9 @@ def fit(
         raise click.UsageError("give either a bundle or --cloud FILE")
     if bundle is not None and bundle.suffix.lower() in (".ply", ".pcd"):
         raise click.UsageError(f"{bundle} is no scan bundle; for a point cloud: --cloud {bundle}")
-    if not (bundle or cloud or out_folder).exists():
-        raise InputError(f"{bundle or cloud} does not exist")
+    for source in (bundle, cloud):
+        if source is not None and not source.exists():
+            raise InputError(f"{source} does not exist")
     _check_folders(out_folder, debug_folder)
     from workers.cloud.cloud_file import read_cloud
     from workers.reconstruct import job
