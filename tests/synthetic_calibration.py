@@ -102,11 +102,15 @@ def observations(
         rng = np.random.default_rng((procedure.booth.seed, index, 9))
         unit = SimulatedUnit.of(procedure.booth, name)
         late_s = clock_error_s * rng.standard_normal()
-        for time_s in np.arange(start_s + unit.phase_s, start_s + procedure.waving_s, 1 / rate_hz):
-            center_m, axis = procedure.ball_center_m(time_s), procedure.axis(BALL, time_s)
-            seen = _ball(unit, center_m, axis, procedure, rng)
-            if seen is not None:
-                waved.append(replace(seen, time_s=float(time_s + late_s)))
+        looks = [
+            replace(seen, time_s=float(time_s + late_s))
+            for time_s in np.arange(
+                start_s + unit.phase_s, start_s + procedure.waving_s, 1 / rate_hz
+            )
+            if (seen := _ball(unit, procedure.ball_center_m(time_s), procedure.axis(BALL, time_s),
+                              procedure, rng))
+        ]  # fmt: skip
+        waved += _fitted(procedure, name, looks)
         for step, found in resting.items():
             axis = procedure.axis(step, 0.0)
             looks = [
@@ -114,6 +118,7 @@ def observations(
                 for time_s in np.arange(0.0, LOOK_S, 0.2)
                 if (seen := _ball(unit, procedure.resting_m(step, time_s), axis, procedure, rng))
             ]
+            looks = _fitted(procedure, name, looks)
             found += whole_swings(looks) if step.startswith(HANGING) else looks
         planes.append(_floor(unit, procedure.booth, rng))
         for place, y in enumerate(procedure.board_at_m if boards else ()):
@@ -134,7 +139,7 @@ def detections(
         unit = SimulatedUnit.of(procedure.booth, name)
         seen = _ball(unit, center_m, procedure.axis(BALL, time_s), procedure, rng)
         if seen is not None:
-            found.append(replace(seen, time_s=time_s))
+            found += _fitted(procedure, name, [replace(seen, time_s=time_s)])
     return found
 
 
@@ -158,12 +163,12 @@ def _ball(
     procedure: VirtualProcedure,
     rng: np.random.Generator,
 ) -> BallDetection | None:
-    lens, believed = unit.camera, procedure.booth.rig.cameras[unit.camera.name]
+    lens = unit.camera
     camera_from_world = invert(lens.world_from_camera)
     center = transform(camera_from_world, center_m)
     if center[2] < 0.6:
         return None
-    radius, stated = procedure.true_radius_m, procedure.radius_m
+    radius = procedure.true_radius_m
     middle = project(lens, center)
     reach = 0.88 * radius * lens.K[0, 0] / center[2]
     size = np.array([lens.width, lens.height])
@@ -185,18 +190,28 @@ def _ball(
     variance = (SQUARE_ERROR / cosine + ROUNDING) / _CELL_PX**2
     measured = 1.0 / reported(unit, pixels, depth) + rng.normal(0.0, np.sqrt(variance))
     patches = np.column_stack([pixels, measured, variance])
-    seen = BallDetection(
-        lens.name, 0.0, center, np.eye(3), len(pixels) * _CELL_PX**2, stated, 2e-3, patches
+    seen_px = len(pixels) * _CELL_PX**2
+    return BallDetection(
+        lens.name, 0.0, center, np.eye(3), seen_px, procedure.radius_m, 2e-3, patches
     )
-    sightings = Sightings.of(believed, [seen])
-    nothing = np.zeros(COARSE.size)
-    sphere = np.zeros((1, SHAPE))
-    detected = corrected_centers(sightings, believed, COARSE, nothing, stated, sphere)
-    rows = ball_rows(sightings, believed, COARSE, detected, nothing, stated, sphere)
-    matrix, _ = center_equations(sightings, rows)
-    return replace(
-        seen, center_m=detected[0], covariance_m2=np.linalg.inv(matrix[0, :3, :3]).astype(float)
-    )
+
+
+def _fitted(
+    procedure: VirtualProcedure, name: str, seen: Sequence[BallDetection]
+) -> list[BallDetection]:
+    """One camera's detections with the centres that their readings give, and their covariances."""
+    if not seen:
+        return []
+    believed, stated = procedure.booth.rig.cameras[name], procedure.radius_m
+    sightings = Sightings.of(believed, list(seen))
+    nothing, sphere = np.zeros(COARSE.size), np.zeros((len(seen), SHAPE))
+    centers = corrected_centers(sightings, believed, COARSE, nothing, stated, sphere)
+    rows = ball_rows(sightings, believed, COARSE, centers, nothing, stated, sphere)
+    covariances = np.linalg.inv(center_equations(sightings, rows)[0][:, :3, :3])
+    return [
+        replace(one, center_m=center, covariance_m2=covariance)
+        for one, center, covariance in zip(seen, centers, covariances, strict=True)
+    ]
 
 
 def _cells() -> Array:

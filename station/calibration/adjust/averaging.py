@@ -19,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from station.calibration.adjust.contacts import Belief, Contacts, beliefs
+from station.calibration.adjust.diagonal import evidence_changes
 from station.calibration.adjust.mixture import Mixture
 from station.calibration.adjust.priors import priors, shape_precision, slope_sigma
 from station.calibration.adjust.problem import (
@@ -51,8 +52,6 @@ Array = NDArray[np.float64]
 Choice = tuple[int, ...]
 """Index of an option of each of ``CLASSES``."""
 
-_BEYOND = 1e300
-"""A corner that keeps a bordered matrix positive."""
 _UNLIKELY = 7.0
 """Choices less likely by a factor e^7 than the best do not count."""
 
@@ -295,7 +294,7 @@ class _SmoothChoice:
     def _climb(self, choice: Choice) -> tuple[Choice, float]:
         while True:
             near = [choice, *self._neighbours(choice)]
-            self._weigh([one for one in near if one not in self._log])
+            self._weigh(choice, [one for one in near if one not in self._log])
             best = max(near, key=lambda one: self._log[one])
             if best == choice:
                 return choice, self._log[choice]
@@ -313,22 +312,19 @@ class _SmoothChoice:
                             if j != choice[b]:
                                 yield (*one[:b], j, *one[b + 1 :])
 
-    def _weigh(self, choices: Sequence[Choice]) -> None:
+    def _weigh(self, here: Choice, choices: Sequence[Choice]) -> None:
+        """The evidence for choices, which differ little from one of them all."""
         if not choices:
             return
-        precision, count = self._diagonals(choices), len(self._values)
-        # The factor's last row, of the right-hand side set below the matrix, is L^-1 right.
-        whole = np.empty((len(choices), count + 1, count + 1))
-        whole[:, :count, :count] = self._information + precision[:, None] * np.eye(count)
-        whole[:, count, :count] = self._gradient + precision * self._values
-        whole[:, :count, count] = whole[:, count, :count]
-        whole[:, count, count] = _BEYOND
-        root = np.linalg.cholesky(whole)
-        half, diagonal = root[:, count, :count], np.einsum("mii->mi", root)[:, :count]
-        log = 0.5 * np.sum(half**2, axis=1) - 0.5 * np.sum(precision * self._values**2, axis=1)
-        log -= np.log(diagonal).sum(axis=1)
-        log += 0.5 * np.log(precision).sum(axis=1) + self._constant
+        own, precision = self._diagonals([here])[0], self._diagonals(choices)
+        whole = self._information + np.diag(own)
+        spread = np.linalg.inv(whole)
+        pull = self._gradient + own * self._values
+        step = spread @ pull
+        log = evidence_changes(spread, step, self._values, own, precision)
+        log += 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(whole)[1])
+        log += 0.5 * np.sum(np.log(precision) - precision * self._values**2, axis=1)
         columns = np.array(choices).T
         log += sum(own[k] for own, k in zip(self._priors, columns, strict=True))
         log += self._lens_prior[tuple(columns[CLASSES.index(name)] for name in LENS)]
-        self._log.update(zip(choices, log.tolist(), strict=True))
+        self._log.update(zip(choices, (self._constant + log).tolist(), strict=True))
