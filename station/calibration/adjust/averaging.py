@@ -10,8 +10,9 @@ that the covariance includes the uncertainty about the widths.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,7 @@ from station.calibration.adjust.widths import (
 )
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 Choice = tuple[int, ...]
 """Index of an option of each of ``CLASSES``."""
 
@@ -205,7 +207,7 @@ class _SmoothChoice:
         self._inner = np.concatenate([g for own in base.groups.values() for g in own])
         self._outer = np.setdiff1d(np.arange(len(gradient)), self._inner)
         inner, outer = self._inner, self._outer
-        self._factor = cho_factor(information[np.ix_(outer, outer)], lower=True)
+        self._factor = cho_factor(information[np.ix_(outer, outer)], lower=True, overwrite_a=True)
         mixed = information[np.ix_(outer, inner)]
         right = np.column_stack([mixed, gradient[outer]])
         solved = cho_solve(self._factor, right)
@@ -225,7 +227,9 @@ class _SmoothChoice:
         ]
         self._priors = [np.array([option.log_prior for option in own]) for own in self._options]
         self._lens_prior = lens_log_prior(len(base.cameras))
-        self._log: dict[Choice, float] = {}
+        self._moves = _moves(tuple(len(own) for own in self._options))
+        self._places = np.cumprod([1, *(len(own) for own in self._options[:-1])])
+        self._visited, self._log = np.zeros((0, len(CLASSES)), np.intp), np.zeros(0)
         self.best = self._search(start)
 
     def widths(self, choice: Choice) -> Widths:
@@ -239,14 +243,13 @@ class _SmoothChoice:
 
     def log_evidence(self) -> float:
         """Log of the sum over all choices that were visited."""
-        return float(logsumexp(list(self._log.values())))
+        return float(logsumexp(self._log))
 
     def moments(self) -> tuple[Array, Array]:
         """Step (m,) to the mean over all choices, and the covariance (m, m) over them."""
-        likely = [(c, log) for c, log in self._log.items() if log > self.best[1] - _UNLIKELY]
-        logs = np.array([log for _, log in likely])
-        weights = np.exp(logs - logsumexp(logs))
-        precision = self._diagonals([choice for choice, _ in likely])
+        likely = self._log > self.best[1] - _UNLIKELY
+        weights = np.exp(self._log[likely] - logsumexp(self._log[likely]))
+        precision = self._diagonals(self._visited[likely])
         spread = np.linalg.inv(self._information + precision[:, None] * np.eye(len(self._values)))
         steps = -np.einsum("mij,mj->mi", spread, self._gradient + precision * self._values)
         mean = weights @ steps
@@ -277,11 +280,10 @@ class _SmoothChoice:
             ]
         )
 
-    def _diagonals(self, choices: Sequence[Choice]) -> Array:
-        """Diagonals (n, m) of the priors' information of n choices."""
-        columns = np.array(choices).T
+    def _diagonals(self, choices: Index) -> Array:
+        """Diagonals (n, m) of the priors' information of choices (n, classes)."""
         return np.concatenate(
-            [own[k] for own, k in zip(self._precisions, columns, strict=True)], axis=1
+            [own[k] for own, k in zip(self._precisions, choices.T, strict=True)], axis=1
         )
 
     def _search(self, start: Choice | None) -> tuple[Choice, float]:
@@ -292,31 +294,26 @@ class _SmoothChoice:
         return max(found, key=lambda one: one[1])
 
     def _climb(self, choice: Choice) -> tuple[Choice, float]:
+        """The choice with the largest evidence, by steps in one class or in two."""
         while True:
-            near = [choice, *self._neighbours(choice)]
-            self._weigh(choice, [one for one in near if one not in self._log])
-            best = max(near, key=lambda one: self._log[one])
-            if best == choice:
-                return choice, self._log[choice]
-            choice = best
+            here = np.array(choice)
+            near = np.where(self._moves < 0, here, self._moves)[~(self._moves == here).any(axis=1)]
+            near = np.concatenate([here[None], near])
+            keys = near @ self._places
+            self._weigh(here, near[~np.isin(keys, self._visited @ self._places)])
+            visited = self._visited @ self._places
+            order = np.argsort(visited)
+            log = self._log[order[np.searchsorted(visited, keys, sorter=order)]]
+            best = int(np.argmax(log))
+            if best == 0:
+                return choice, float(log[0])
+            choice = tuple(near[best].tolist())
 
-    def _neighbours(self, choice: Choice) -> Iterator[Choice]:
-        """Choices that differ in one class, or in two."""
-        for a in range(len(CLASSES)):
-            for k in range(len(self._options[a])):
-                one = (*choice[:a], k, *choice[a + 1 :])
-                if k != choice[a]:
-                    yield one
-                    for b in range(a):
-                        for j in range(len(self._options[b])):
-                            if j != choice[b]:
-                                yield (*one[:b], j, *one[b + 1 :])
-
-    def _weigh(self, here: Choice, choices: Sequence[Choice]) -> None:
-        """The evidence for choices, which differ little from one of them all."""
-        if not choices:
+    def _weigh(self, here: Index, choices: Index) -> None:
+        """Visit choices (n, classes), which differ little from one of them all."""
+        if not len(choices):
             return
-        own, precision = self._diagonals([here])[0], self._diagonals(choices)
+        own, precision = self._diagonals(here[None])[0], self._diagonals(choices)
         whole = self._information + np.diag(own)
         spread = np.linalg.inv(whole)
         pull = self._gradient + own * self._values
@@ -324,7 +321,18 @@ class _SmoothChoice:
         log = evidence_changes(spread, step, self._values, own, precision)
         log += 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(whole)[1])
         log += 0.5 * np.sum(np.log(precision) - precision * self._values**2, axis=1)
-        columns = np.array(choices).T
-        log += sum(own[k] for own, k in zip(self._priors, columns, strict=True))
-        log += self._lens_prior[tuple(columns[CLASSES.index(name)] for name in LENS)]
-        self._log.update(zip(choices, (self._constant + log).tolist(), strict=True))
+        log += sum(own[k] for own, k in zip(self._priors, choices.T, strict=True))
+        log += self._lens_prior[tuple(choices[:, CLASSES.index(name)] for name in LENS)]
+        self._visited = np.concatenate([self._visited, choices])
+        self._log = np.concatenate([self._log, self._constant + log])
+
+
+@cache
+def _moves(options: tuple[int, ...]) -> Index:
+    """Changes (n, classes) of one class or two to all of their options; -1 where one stays."""
+    found = []
+    for a, b in combinations_with_replacement(range(len(options)), 2):
+        for k in range(options[a]):
+            for j in range(options[b]) if a < b else (k,):
+                found.append([k if c == a else j if c == b else -1 for c in range(len(options))])
+    return np.array(found)
