@@ -13,8 +13,7 @@ def test_changes_are_those_of_a_new_factorisation() -> None:
     count = 12
     rows = rng.normal(size=(30, count))
     information, gradient = rows.T @ rows, 5.0 * rng.normal(size=count)
-    values = rng.normal(size=count)
-    before = np.asarray(10.0 ** rng.uniform(-1.0, 3.0, count), np.float64)
+    values, before = rng.normal(size=count), 10.0 ** rng.uniform(-1.0, 3.0, count)
 
     def evidence(prior: Array) -> float:
         whole, pull = information + np.diag(prior), gradient + prior * values
@@ -25,7 +24,7 @@ def test_changes_are_those_of_a_new_factorisation() -> None:
     for number, prior in enumerate(after):
         changed = rng.choice(count, number % count, replace=False)
         prior[changed] *= 10.0 ** rng.uniform(-3.0, 3.0, len(changed))
-    spread = np.linalg.inv(information + np.diag(before))
+    spread = np.asarray(np.linalg.inv(information + np.diag(before)), np.float64)
     step = spread @ (gradient + before * values)
     found = evidence_changes(spread, step, values, before, after)
     expected = [evidence(prior) - evidence(before) for prior in after]
