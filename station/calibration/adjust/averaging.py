@@ -315,11 +315,14 @@ class _SmoothChoice:
             return
         own, precision = self._diagonals(here[None])[0], self._diagonals(choices)
         whole = self._information + np.diag(own)
+        sign, log_det = np.linalg.slogdet(whole)
+        if sign <= 0.0:
+            raise np.linalg.LinAlgError("what the priors leave open is not determined")
         spread = np.linalg.inv(whole)
         pull = self._gradient + own * self._values
         step = spread @ pull
         log = evidence_changes(spread, step, self._values, own, precision)
-        log += 0.5 * float(pull @ step) - 0.5 * float(np.linalg.slogdet(whole)[1])
+        log += 0.5 * float(pull @ step) - 0.5 * float(log_det)
         log += 0.5 * np.sum(np.log(precision) - precision * self._values**2, axis=1)
         log += sum(own[k] for own, k in zip(self._priors, choices.T, strict=True))
         log += self._lens_prior[tuple(choices[:, CLASSES.index(name)] for name in LENS)]

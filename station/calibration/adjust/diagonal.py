@@ -1,4 +1,4 @@
-"""What a change of a few diagonal entries does to the evidence of a quadratic."""
+"""Evidence of a quadratic after a change of a few diagonal entries."""
 
 from __future__ import annotations
 
