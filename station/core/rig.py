@@ -55,6 +55,8 @@ class PredictedError:
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> PredictedError:
         names = ("height_sigma_m", "girth_sigma_m", "normal_rms_m", "tilt_sigma_rad")
+        if not isinstance(fields, Mapping):
+            raise ValueError(f"predicted must hold {', '.join(names)}")
         values = [float(fields[name]) for name in names]
         for name, value in zip(names, values, strict=True):
             most = _LARGEST_ERROR_RAD if name.endswith("rad") else _LARGEST_ERROR_M

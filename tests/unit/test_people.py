@@ -15,14 +15,14 @@ from station.booth.health import booth_health
 from station.calibration.drift.check_cli import check
 from station.calibration.drift.kept import FOLDER, problem_in_words, use_correction
 from station.calibration.drift.motion import LEVER_M
-from station.calibration.drift.people import ENOUGH, Evidence, find_drift
+from station.calibration.drift.people import ENOUGH, Drift, Evidence, corrected, find_drift
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import CalibrationError
 from station.core.geometry import se3_exp
-from station.core.rig import Rig
+from station.core.rig import PredictedError, Rig
 from station.simulation.scene import default_rig
 from workers.reconstruct.pool import CAMERAS, keep_evidence
 from workers.scape.evidence.cameras import CameraEvidence
@@ -144,6 +144,18 @@ def test_a_correction_is_a_dated_calibration_in_use(config: BoothConfig) -> None
     assert problem_in_words(config) == []
     with pytest.raises(CalibrationError, match="in the scans of 0 people"):
         use_correction(config, "2026-11-03T10:00:00Z")
+
+
+def test_a_corrected_calibration_is_known_as_well_as_people_tell_it() -> None:
+    stated = PredictedError(0.001, 0.0005, 0.0001, 0.001)
+    covariance = np.diag([1e-3**2] * 3 + [0.002**2] * 3)
+    drift = Drift("back-upper", TURNED, covariance, confirmed=True)
+    found = corrected(replace(RIG, predicted=stated), drift, "2026").predicted
+    assert found is not None
+    # Two millimetres, and a milliradian at two metres for two of three axes.
+    assert 0.0022 < found.normal_rms_m < 0.003
+    assert found.girth_sigma_m > 2.0 * found.normal_rms_m
+    assert found.tilt_sigma_rad == stated.tilt_sigma_rad
 
 
 def test_nothing_is_corrected_without_cause(config: BoothConfig) -> None:

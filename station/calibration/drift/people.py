@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.drift.motion import LEVER_M, move_words
-from station.core.geometry import se3_exp
+from station.core.geometry import invert, se3_exp, skew, transform
 from station.core.rig import Rig
 
 Array = NDArray[np.float64]
@@ -42,6 +42,8 @@ _PRIOR_SIGMA_M = 0.02
 _STRANGE = 2.0
 """A scan that disagrees more than so many times the median one counts less."""
 _ROUNDS = 8
+_TRUNK_M = 1.1
+"""Height of the middle of a trunk."""
 _SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
 
 
@@ -115,7 +117,8 @@ def find_drift(scans: Sequence[Evidence]) -> Drift | None:
 
 
 def corrected(rig: Rig, drift: Drift, created: str) -> Rig:
-    """A calibration in which the camera stands where the people saw it.
+    """A calibration in which the camera stands where the people saw it, and is known as well as
+    they tell it.
 
     Args:
         created: date of the new calibration, UTC, ISO 8601.
@@ -127,7 +130,26 @@ def corrected(rig: Rig, drift: Drift, created: str) -> Rig:
         world_from_camera=camera.world_from_camera @ se3_exp(drift.xi),
         covariance=before + drift.covariance,
     )
-    return replace(rig, created=created, cameras={**rig.cameras, drift.camera: moved})
+    predicted = rig.predicted
+    if predicted is not None:
+        off_m = _sigma_at_mark(moved.world_from_camera, drift.covariance)
+        # A camera sees half of a girth.
+        predicted = replace(
+            predicted,
+            height_sigma_m=float(np.hypot(predicted.height_sigma_m, off_m)),
+            girth_sigma_m=float(np.hypot(predicted.girth_sigma_m, np.pi * off_m)),
+            normal_rms_m=float(np.hypot(predicted.normal_rms_m, off_m)),
+        )
+    cameras = {**rig.cameras, drift.camera: moved}
+    return replace(rig, created=created, cameras=cameras, predicted=predicted)
+
+
+def _sigma_at_mark(world_from_camera: Array, covariance: Array) -> float:
+    """Standard deviation (m) along one axis of where a camera of an uncertain pose (6, 6) sees a
+    trunk above the mark."""
+    seen = transform(invert(world_from_camera), np.array([0.0, 0.0, _TRUNK_M]))
+    by_pose = np.concatenate([-skew(seen), np.eye(3)], axis=1)
+    return float(np.sqrt(np.trace(by_pose @ covariance @ by_pose.T) / 3.0))
 
 
 @dataclass(frozen=True, slots=True)
