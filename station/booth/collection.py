@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from station.booth.frameset import Frameset
+from station.core.kinect_v1 import FRAME_RATE_HZ
 from station.core.rig import Rig
 from station.core.scans import ScanId
 from station.messaging.intake import LiveFrame
@@ -49,21 +50,52 @@ class Collection:
         """Metres per unit of its depth images."""
         return next(iter(self.sets[0].frames.values())).header.depth_scale_m
 
-    def too_few(self, silent: Sequence[str], troubles: Sequence[str], within_s: float) -> str:
-        """Reason why the framesets did not arrive in time."""
+    def too_few(
+        self,
+        silent: Sequence[str],
+        recorded: Set[str],
+        troubles: Sequence[str],
+        within_s: float,
+        tolerance_s: float,
+    ) -> str:
+        """Reason why the framesets did not arrive in time; the arguments as elsewhere here."""
         if troubles:
             return "; ".join(troubles)
         if silent:
-            return f"camera {', '.join(silent)} went silent; check its cable and scan again"
-        return too_slow_words(len(self.sets), self.wanted, within_s)
+            remedy = check_words(silent, recorded)
+            return f"camera {', '.join(silent)} went silent; {remedy}; scan again"
+        return too_slow_words(len(self.sets), self.wanted, within_s, tolerance_s)
 
 
-def too_slow_words(count: int, wanted: int, within_s: float) -> str:
-    """Cause and remedy where cameras work and too few framesets come."""
+def too_slow_words(count: int, wanted: int, within_s: float, tolerance_s: float) -> str:
+    """Cause and remedy where cameras work and too few framesets come.
+
+    Args:
+        tolerance_s: widest spread of a frameset. Cameras take their pictures when they like: the
+            nearest of another one is up to half a frame away.
+    """
+    needed_s = wanted / FRAME_RATE_HZ
+    if needed_s > within_s:
+        return (
+            f"{wanted} pictures of a scan take {needed_s:.1f} s, and it may take {within_s:g} s: "
+            "raise scan.max_duration_s in booth.toml, or lower scan.framesets"
+        )
+    if tolerance_s < 0.5 / FRAME_RATE_HZ:
+        return (
+            f"only {count} of the {wanted} pictures of a scan came within {within_s:g} s: pictures "
+            "of the cameras are farther apart than sync.tolerance_s allows; raise it in booth.toml"
+        )
     return (
         f"only {count} of the {wanted} pictures of a scan came within {within_s:g} s: this "
         "computer is too busy; stop other programs, then scan again"
     )
+
+
+def check_words(silent: Sequence[str], recorded: Set[str]) -> str:
+    """Remedy for cameras that send no frames; ``recorded``: all that play recordings."""
+    if recorded >= set(silent):
+        return "check the recording" if len(silent) == 1 else "check the recordings"
+    return "check its cable" if len(silent) == 1 else "check their cables"
 
 
 def silence_in_words(why: Mapping[str, str]) -> str:

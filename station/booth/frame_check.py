@@ -31,6 +31,8 @@ _STEPS = 15
 class FrameCheck:
     """Plausibility of one camera's frames. Feed it every frame."""
 
+    replays: bool = False
+    """The camera plays a recording."""
     _ticks: int | None = None
     _sequence: int = 0
     _picture: int | None = None
@@ -68,14 +70,17 @@ class FrameCheck:
     def trouble(self, now_s: float) -> str:
         """The problem and its remedy in words; empty when there is none."""
         if now_s - self._trouble_s < _REMEMBERED_S:
-            return f"{self._trouble}; unplug the sensor and plug it in again"
+            return f"{self._trouble}; {self._remedy('unplug the sensor and plug it in again')}"
         if self._slow():
             rate_hz = self.rate_hz()
+            remedy = self._remedy("connect it to a USB controller of its own")
             return (
-                f"it sends {rate_hz:.0f} frames per second, {MIN_RATE_HZ:.0f} are needed; "
-                "connect it to a USB controller of its own"
+                f"it sends {rate_hz:.0f} frames per second, {MIN_RATE_HZ:.0f} are needed; {remedy}"
             )
         return ""
+
+    def _remedy(self, of_sensor: str) -> str:
+        return "record it again" if self.replays else of_sensor
 
     def _slow(self) -> bool:
         rate_hz = self.rate_hz()

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from station.booth.collection import silence_in_words
+from station.booth.collection import check_words, silence_in_words
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
@@ -123,10 +123,7 @@ def _cameras(
             detail = told[name]["detail"]
             silent[name] = f" ({detail})" if detail else ""
     if silent:
-        if recorded.issuperset(silent):
-            remedy = "check the recording" if len(silent) == 1 else "check the recordings"
-        else:
-            remedy = "check its cable" if len(silent) == 1 else "check their cables"
+        remedy = check_words(list(silent), recorded)
         problems.append(f"{silence_in_words(silent)}; {remedy}")
     return problems
 

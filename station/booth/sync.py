@@ -12,7 +12,14 @@ from typing import Any
 import click
 import zmq
 
-from station.booth.collection import LATE, Collection, Order, silence_in_words, too_slow_words
+from station.booth.collection import (
+    LATE,
+    Collection,
+    Order,
+    check_words,
+    silence_in_words,
+    too_slow_words,
+)
 from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import LiveCloud, frameset_points, is_empty
@@ -25,7 +32,6 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
-from station.core.kinect_v1 import FRAME_RATE_HZ
 from station.core.rig import Rig
 from station.core.scans import ScanId, scan_id_of
 from station.core.service import Heartbeat, only_process, stop_event
@@ -54,7 +60,8 @@ class SyncProcess:
         self._matcher: FramesetMatcher[LiveFrame] = FramesetMatcher(
             self._names, config.sync.tolerance_s
         )
-        self._checks = {name: FrameCheck() for name in self._names}
+        self._recorded = {camera.name for camera in config.cameras if camera.replays}
+        self._checks = {name: FrameCheck(replays=name in self._recorded) for name in self._names}
         self._serials: dict[str, str] = {}
         self._live = LiveCloud(config.calibration, config.sync.live_hz)
         drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration))
@@ -156,7 +163,11 @@ class SyncProcess:
             return
         self._collection = None
         reason = collection.too_few(
-            self._silent(), self._troubles(), self._config.scan.max_duration_s
+            self._silent(),
+            self._recorded,
+            self._troubles(),
+            self._config.scan.max_duration_s,
+            self._config.sync.tolerance_s,
         )
         self._fail(collection.order, reason)
 
@@ -184,10 +195,9 @@ class SyncProcess:
         stopped = self._silent_s > since_s or self._intake.silent(_FLOWING_S)
         if count >= scan.framesets or stopped or self._troubles():
             return ""
-        needed_s = scan.framesets / FRAME_RATE_HZ
-        if needed_s > scan.max_duration_s:
-            return f"{scan.framesets} pictures take {needed_s:.1f} s, longer than max_duration_s"
-        return too_slow_words(count, scan.framesets, scan.max_duration_s)
+        return too_slow_words(
+            count, scan.framesets, scan.max_duration_s, self._config.sync.tolerance_s
+        )
 
     def _useless(self, rig: Rig, last: Frameset[LiveFrame]) -> str:
         """Reason why a scan that ended with a frameset shows no body; empty if it may show one."""
@@ -246,11 +256,13 @@ class SyncProcess:
             return f"scan {current and current.scan_id} is being taken; wait until it is done"
         if silent := self._silent():
             told = silence_in_words({name: self._intake.why(name) for name in silent})
-            return f"{told}; scan again in a few seconds; " + (
-                "if it stays silent, check its cable, see station status"
+            stays = (
+                "if it stays silent, see station status"
                 if len(silent) == 1
-                else "if they stay silent, check their cables, see station status"
+                else "if they stay silent, see station status"
             )
+            remedy = check_words(silent, self._recorded)
+            return f"{told}; scan again in a few seconds; {stays}; {remedy}"
         return "; ".join(self._troubles())
 
     def _cancel(self, scan_id: ScanId) -> Reply:

@@ -60,6 +60,10 @@ def test_half_the_rate_is_named_and_lost_frames_are_not() -> None:
     # Its first half second tells its rate; none of its frames is used after that.
     assert _run(slow, 30, hz=15.0) == 15
     assert "15 frames per second" in slow.trouble(30 / 15)
+    assert "USB" in slow.trouble(30 / 15)
+    replayed = FrameCheck(replays=True)
+    _run(replayed, 30, hz=15.0)
+    assert replayed.trouble(30 / 15).endswith("; record it again")
     rng = np.random.default_rng(0)
     for i in range(1, 200):
         if rng.random() > 0.3:
