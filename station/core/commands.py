@@ -8,6 +8,8 @@ from __future__ import annotations
 import errno
 import importlib
 import math
+import os
+import signal
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -107,11 +109,27 @@ def writable_folder(folder: Path, option: str, mode: int = 0o777) -> None:
         ) from None
 
 
+class _Terminated(SystemExit):
+    """SIGTERM was received."""
+
+
+def _terminate(*_: object) -> None:
+    raise _Terminated
+
+
 def run(group: click.Group) -> None:
-    """Call a command; an error that the user can act upon becomes one line and exit code 1."""
+    """Call a command; an error that the user can act upon becomes one line and exit code 1.
+
+    SIGTERM ends it as it would by default, once folders that were made for its time are gone.
+    Processes that run until they are stopped handle it themselves.
+    """
     set_up_caches()
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         group()
+    except _Terminated:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTERM)
     except BoothError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)

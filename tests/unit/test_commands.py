@@ -1,4 +1,5 @@
 import importlib
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -141,6 +142,27 @@ def test_a_folder_is_no_file_for_a_model(tmp_path: Path) -> None:
     done = CliRunner().invoke(workers_cli.reconstruct, ["train", "--out", str(tmp_path)])
     assert done.exit_code == 2
     assert "is a directory" in done.output
+
+
+def test_a_command_that_is_told_to_end_leaves_no_folder(tmp_path: Path) -> None:
+    """Half a result stayed beside --out."""
+    source = (
+        "import click, tempfile, time\n"
+        "from station.core.commands import run\n"
+        "@click.group(invoke_without_command=True)\n"
+        "def wait():\n"
+        f"    with tempfile.TemporaryDirectory(dir={str(tmp_path)!r}):\n"
+        "        print('waits', flush=True)\n"
+        "        time.sleep(60)\n"
+        "run(wait)\n"
+    )
+    command = [sys.executable, "-c", source]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as waiting:
+        assert waiting.stdout is not None
+        assert waiting.stdout.readline() == "waits\n"
+        waiting.terminate()
+        assert waiting.wait(20.0) == -signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
