@@ -67,8 +67,7 @@ def scan_id_of(text: object) -> ScanId:
     """
     if not isinstance(text, str) or _SCAN_ID.fullmatch(text) is None:
         raise InputError(
-            f"{text!a:.80} is not a valid scan id: use 1 to 64 letters, digits, '-' and '_', or "
-            "leave it out to get a new one"
+            f"{text!a:.80} is not a valid scan id: use 1 to 64 letters, digits, '-' and '_'"
         )
     return ScanId(text)
 

@@ -88,6 +88,17 @@ def test_recordings_are_replayed_through_capture_processes(tmp_path: Path) -> No
         assert (np.diff(values) > 0).all()
 
 
+def test_a_replay_is_not_over_while_its_frames_wait(tmp_path: Path) -> None:
+    """A short recording that ended before its reader began was called too short."""
+    _record(tmp_path / "front", 30)
+    with replayed_feed(_config("front"), tmp_path) as feed:
+        feed.cameras(20.0)
+        while not all(clock.over for clock in feed._clocks.values()):
+            feed._receive(0.1)
+        assert not feed.over
+        assert len(gather_frames(feed, ["front"], 30, lambda _: None)["front"]) == 30
+
+
 def test_a_slow_reader_of_a_replay_misses_nothing(tmp_path: Path) -> None:
     """Frames that came while it was busy were lost, and the step was refused on a slow machine."""
     names = ("front", "back")

@@ -12,6 +12,7 @@ from typing import cast
 import click
 import pytest
 
+from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.step_names import BALL, EMPTY
 from station.calibration.guide import attempt, procedure, raised_ball
 from station.calibration.guide.operator import Guide
@@ -393,3 +394,12 @@ def test_a_recording_of_the_ball_is_looked_at_once(
     assert replayed._waved(session)
     (recording / INDEX).write_text("d-2.0-2-0.pgm\n")
     assert not replayed._waved(session)
+
+
+def test_a_ball_that_was_waved_enough_needs_no_recording(
+    guided: tuple[Procedure, Session, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, session, _ = guided
+    monkeypatch.setattr(Coverage, "enough", True)
+    (tmp_path / "recordings").mkdir()
+    assert replace(begun, recordings=tmp_path / "recordings")._waved(session)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import tempfile
 from pathlib import Path
@@ -115,9 +116,11 @@ def fit(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     click.echo(f"{out_folder}: {summary.status}")
-    click.echo(f"  its table: reconstruct measure {out_folder}", err=True)
     for reason in summary.reasons:
         click.echo(f"  {reason}")
+    if not quiet:
+        folder = shlex.quote(str(out_folder))
+        click.echo(f"its table: reconstruct measure {folder}", err=True)
 
 
 def _publish(temporary: Path, out_folder: Path) -> None:

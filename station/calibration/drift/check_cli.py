@@ -97,15 +97,21 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
     """Estimates of how far each camera stands from where it was calibrated."""
     rig = Rig.load(config.calibration)
     scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
-    missing = [camera.name for camera in config.cameras if camera.name not in scene]
+    names = [camera.name for camera in config.cameras]
+    missing = [name for name in names if name not in scene]
     if missing:
         raise CalibrationError(
             f"the calibration in use ({config.calibration}) has no picture of the empty booth by "
             f"camera {', '.join(missing)}; calibrate with station calibrate"
         )
+    if others := [name for name in scene if name not in names]:
+        click.echo(
+            f"camera {', '.join(others)} is calibrated but not in booth.toml: not looked at",
+            err=True,
+        )
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
-        taken = _look(feed, list(scene), quiet)
+        taken = _look(feed, names, quiet)
     return [
         estimate_move(
             DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),

@@ -87,6 +87,14 @@ class Attempt:
             self.remark_on_ghosts(session)
             return session, rest_ball(feed, session, self.guide, step)
 
+    def tell_of_replay(self) -> None:
+        """Say so where what a step asks for was done when it was recorded."""
+        if self.recordings is not None:
+            self.guide.say(
+                "recordings are replayed; there is nothing to do, and the instructions are those "
+                "of a live booth"
+            )
+
     def check_station(self) -> None:
         """Refuse before anybody has put something up, rather than after a countdown."""
         if self.guide.attended:

@@ -92,6 +92,7 @@ def _step(command: Callable[..., None]) -> Callable[..., Any]:
     @_options
     @functools.wraps(command)
     def wrapped(procedure: Procedure, **kwargs: Any) -> None:
+        procedure.tell_of_replay()
         command(procedure, **kwargs)
         following = procedure.following("station calibrate solve puts it into use")
         click.echo(f"  {following}")

@@ -50,7 +50,7 @@ class TimedFrame:
     camera: str
     time_s: float
     depth: NDArray[np.uint16]
-    """(height, width) in units of scale_m, 0 = no reading."""
+    """(height, width) in units of scale_m, 0 = no reading; empty where only `pixels` has it."""
     scale_m: float
     clock_resets: int = 0
     """Number of resets of the camera's clock so far."""
@@ -102,8 +102,9 @@ class Feed:
 
     @property
     def over(self) -> bool:
-        """All recordings have been seen once; live cameras never end."""
-        return bool(self._clocks) and all(clock.over for clock in self._clocks.values())
+        """All recordings have been seen once and no frame waits; live cameras never end."""
+        ended = bool(self._clocks) and all(clock.over for clock in self._clocks.values())
+        return ended and not self._waiting
 
     def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
         """Every camera as it comes from the factory, once all of them give frames.

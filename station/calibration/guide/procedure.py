@@ -45,11 +45,7 @@ class Procedure(Attempt):
     def run(self) -> None:
         """All steps that are not done yet."""
         self._check_recordings()
-        if self.recordings is not None:
-            self.guide.say(
-                "recordings are replayed; there is nothing to do, and the instructions are those "
-                "of a live booth"
-            )
+        self.tell_of_replay()
         session = self.unfinished_session()
         if session is not None and session.adds_to:
             raise CalibrationError(
@@ -84,13 +80,15 @@ class Procedure(Attempt):
         """Whether the ball was waved enough, or as long as is asked for or recorded: then a camera
         may lack something that more of it would not show."""
         coverage = coverage_so_far(session, self.config.reference)
+        if coverage.enough:
+            return True
         over = (
             session.waved_s >= self.config.calibrate.waving_s
             if self.recordings is None
             else session.replayed == fingerprint(step_folder(self.recordings, BALL))
         )
-        if coverage.enough or not over:
-            return coverage.enough
+        if not over:
+            return False
         self.guide.say(
             f"the ball was waved for {session.waved_s} s; more of it would help (station "
             f"calibrate ball): {coverage.advice()}"

@@ -54,7 +54,7 @@ def step_folder(recordings: Path, step: str) -> Path:
 
 
 def fingerprint(folder: Path) -> str:
-    """A text that differs between recordings of a step: a digest of their lists of frames."""
+    """A digest of a step's lists of frames: their times and names differ between recordings."""
     lists = sorted(folder.glob(f"*/{INDEX}"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in lists)).hexdigest()[:16]
 
