@@ -58,7 +58,12 @@ class Collection:
         within_s: float,
         tolerance_s: float,
     ) -> str:
-        """Reason why the framesets did not arrive in time; the arguments as elsewhere here."""
+        """Reason why the framesets did not arrive in time.
+
+        Args:
+            recorded, tolerance_s: as in `check_words` and `too_slow_words`.
+            troubles: what is wrong with cameras that send frames.
+        """
         if troubles:
             return "; ".join(troubles)
         if silent:

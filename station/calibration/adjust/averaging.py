@@ -230,6 +230,7 @@ class _SmoothChoice:
         self._moves = _moves(tuple(len(own) for own in self._options))
         self._places = np.cumprod([1, *(len(own) for own in self._options[:-1])])
         self._visited, self._log = np.zeros((0, len(CLASSES)), np.intp), np.zeros(0)
+        self._keys = np.zeros(0, np.intp)
         self.best = self._search(start)
 
     def widths(self, choice: Choice) -> Widths:
@@ -300,10 +301,9 @@ class _SmoothChoice:
             near = np.where(self._moves < 0, here, self._moves)[~(self._moves == here).any(axis=1)]
             near = np.concatenate([here[None], near])
             keys = near @ self._places
-            self._weigh(here, near[~np.isin(keys, self._visited @ self._places)])
-            visited = self._visited @ self._places
-            order = np.argsort(visited)
-            log = self._log[order[np.searchsorted(visited, keys, sorter=order)]]
+            self._weigh(here, near[~np.isin(keys, self._keys)])
+            order = np.argsort(self._keys)
+            log = self._log[order[np.searchsorted(self._keys, keys, sorter=order)]]
             best = int(np.argmax(log))
             if best == 0:
                 return choice, float(log[0])
@@ -327,6 +327,7 @@ class _SmoothChoice:
         log += sum(own[k] for own, k in zip(self._priors, choices.T, strict=True))
         log += self._lens_prior[tuple(choices[:, CLASSES.index(name)] for name in LENS)]
         self._visited = np.concatenate([self._visited, choices])
+        self._keys = np.concatenate([self._keys, choices @ self._places])
         self._log = np.concatenate([self._log, self._constant + log])
 
 

@@ -16,7 +16,7 @@ def evidence_changes(
 
     The prior of the information p about the deviations v has p on the diagonal of H and p v in g.
     With the few entries d of the change, both follow from matrices of their number (the matrix
-    determinant lemma, and Woodbury's identity), about a hundred times as fast as a factorisation.
+    determinant lemma, and Woodbury's identity), ten times as fast as a factorisation.
 
     Args:
         spread: (m, m), H^-1 before the change.
