@@ -227,10 +227,8 @@ class _SmoothChoice:
         ]
         self._priors = [np.array([option.log_prior for option in own]) for own in self._options]
         self._lens_prior = lens_log_prior(len(base.cameras))
-        self._moves = _moves(tuple(len(own) for own in self._options))
-        self._places = np.cumprod([1, *(len(own) for own in self._options[:-1])])
-        self._visited, self._log = np.zeros((0, len(CLASSES)), np.intp), np.zeros(0)
-        self._keys = np.zeros(0, np.intp)
+        self._counts = tuple(len(own) for own in self._options)
+        self._visited, self._log = np.zeros(0, np.intp), np.zeros(0)
         self.best = self._search(start)
 
     def widths(self, choice: Choice) -> Widths:
@@ -250,7 +248,8 @@ class _SmoothChoice:
         """Step (m,) to the mean over all choices, and the covariance (m, m) over them."""
         likely = self._log > self.best[1] - _UNLIKELY
         weights = np.exp(self._log[likely] - logsumexp(self._log[likely]))
-        precision = self._diagonals(self._visited[likely])
+        visited = np.unravel_index(self._visited[likely], self._counts)
+        precision = self._diagonals(np.stack(visited, axis=1))
         spread = np.linalg.inv(self._information + precision[:, None] * np.eye(len(self._values)))
         steps = -np.einsum("mij,mj->mi", spread, self._gradient + precision * self._values)
         mean = weights @ steps
@@ -296,18 +295,23 @@ class _SmoothChoice:
 
     def _climb(self, choice: Choice) -> tuple[Choice, float]:
         """The choice with the largest evidence, by steps in one class or in two."""
+        moves = _moves(self._counts)
         while True:
             here = np.array(choice)
-            near = np.where(self._moves < 0, here, self._moves)[~(self._moves == here).any(axis=1)]
+            near = np.where(moves < 0, here, moves)[~(moves == here).any(axis=1)]
             near = np.concatenate([here[None], near])
-            keys = near @ self._places
-            self._weigh(here, near[~np.isin(keys, self._keys)])
-            order = np.argsort(self._keys)
-            log = self._log[order[np.searchsorted(self._keys, keys, sorter=order)]]
+            keys = self._keys(near)
+            self._weigh(here, near[~np.isin(keys, self._visited)])
+            order = np.argsort(self._visited)
+            log = self._log[order[np.searchsorted(self._visited, keys, sorter=order)]]
             best = int(np.argmax(log))
             if best == 0:
                 return choice, float(log[0])
             choice = tuple(near[best].tolist())
+
+    def _keys(self, choices: Index) -> Index:
+        """One number (n,) for each of choices (n, classes)."""
+        return np.asarray(np.ravel_multi_index(list(choices.T), self._counts), np.intp)
 
     def _weigh(self, here: Index, choices: Index) -> None:
         """Visit choices (n, classes), which differ little from one of them all."""
@@ -326,8 +330,7 @@ class _SmoothChoice:
         log += 0.5 * np.sum(np.log(precision) - precision * self._values**2, axis=1)
         log += sum(own[k] for own, k in zip(self._priors, choices.T, strict=True))
         log += self._lens_prior[tuple(choices[:, CLASSES.index(name)] for name in LENS)]
-        self._visited = np.concatenate([self._visited, choices])
-        self._keys = np.concatenate([self._keys, choices @ self._places])
+        self._visited = np.concatenate([self._visited, self._keys(choices)])
         self._log = np.concatenate([self._log, self._constant + log])
 
 
