@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,9 +54,8 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     if not reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
     hanging = {name for name in sync.get("silent", ()) if not reports(processes[f"capture {name}"])}
-    recorded = {camera.name for camera in config.cameras if camera.replays}
     wanted = bool(processes["control"].get("streaming"))
-    problems += _cameras(sync, hanging, recorded, wanted=wanted)
+    problems += _cameras(sync, hanging, config.recorded, wanted=wanted)
     problems += [
         str(problem)
         for content in processes.values()
@@ -102,7 +101,7 @@ def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _cameras(
-    sync: dict[str, Any], hanging: set[str], recorded: set[str], *, wanted: bool
+    sync: dict[str, Any], hanging: set[str], recorded: Set[str], *, wanted: bool
 ) -> list[str]:
     """Cameras whose frames are not what they should be.
 

@@ -60,8 +60,7 @@ class SyncProcess:
         self._matcher: FramesetMatcher[LiveFrame] = FramesetMatcher(
             self._names, config.sync.tolerance_s
         )
-        self._recorded = {camera.name for camera in config.cameras if camera.replays}
-        self._checks = {name: FrameCheck(replays=name in self._recorded) for name in self._names}
+        self._checks = {name: FrameCheck(replays=name in config.recorded) for name in self._names}
         self._serials: dict[str, str] = {}
         self._live = LiveCloud(config.calibration, config.sync.live_hz)
         drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration))
@@ -164,7 +163,7 @@ class SyncProcess:
         self._collection = None
         reason = collection.too_few(
             self._silent(),
-            self._recorded,
+            self._config.recorded,
             self._troubles(),
             self._config.scan.max_duration_s,
             self._config.sync.tolerance_s,
@@ -261,7 +260,7 @@ class SyncProcess:
                 if len(silent) == 1
                 else "if they stay silent, see station status"
             )
-            remedy = check_words(silent, self._recorded)
+            remedy = check_words(silent, self._config.recorded)
             return f"{told}; scan again in a few seconds; {stays}; {remedy}"
         return "; ".join(self._troubles())
 

@@ -260,6 +260,11 @@ class BoothConfig(Strict):
         names = tuple(camera.name for camera in self.cameras)
         return self.calibrate.front or tuple(n for n in names if n.startswith("front"))
 
+    @property
+    def recorded(self) -> frozenset[str]:
+        """The cameras that play recordings."""
+        return frozenset(camera.name for camera in self.cameras if camera.replays)
+
     def camera(self, name: str) -> CameraConfig:
         """A camera's section.
 
