@@ -11,7 +11,7 @@ that the covariance includes the uncertainty about the widths.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -56,11 +56,13 @@ Choice = tuple[int, ...]
 
 _UNLIKELY = 7.0
 """Choices less likely by a factor e^7 than the best do not count."""
+_MIDDLE = len(FIELD_LEVELS) // 2, len(SHAPE_LEVELS) // 2
+"""Levels of depth fields and ball shape."""
 
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    best = _smooth_choices(_Base.of(problem, state))[0]
+    best = _smooth_choices(_Base.of(problem, state), _MIDDLE)[0]
     return best.widths(best.best[0])
 
 
@@ -71,7 +73,7 @@ def averaged_state(problem: Problem, state: State) -> State:
     sure, *doubtful = beliefs(problem)
     mixture, base = Mixture(layout.size), _Base.of(problem, state)
     smooth = []
-    for one in _smooth_choices(base.under(contacts, sure)):
+    for one in _smooth_choices(base.under(contacts, sure), _smooth_levels(problem.widths)):
         if _add(mixture, sure, one):
             smooth.append((one.levels, one.best[0]))
     for belief in doubtful:
@@ -99,14 +101,22 @@ def _add(mixture: Mixture, belief: Belief, one: _SmoothChoice) -> bool:
     return True
 
 
-def _smooth_choices(base: _Base) -> list[_SmoothChoice]:
-    """The evidence for levels of depth fields and ball shape, climbed from the middle; the largest
+def _smooth_levels(widths: Widths) -> tuple[int, int]:
+    """Levels of depth fields and ball shape, nearest to these widths."""
+    return (
+        int(np.argmin(np.abs(np.log(FIELD_LEVELS / widths.field_per_m)))),
+        int(np.argmin(np.abs(np.log(np.array(SHAPE_LEVELS) / widths.shape)))),
+    )
+
+
+def _smooth_choices(base: _Base, start: tuple[int, int]) -> list[_SmoothChoice]:
+    """The evidence for levels of depth fields and ball shape, climbed from ``start``; the largest
     first.
 
     Each search goes on from the best choice of the level before.
     """
     levels = (len(FIELD_LEVELS), len(SHAPE_LEVELS) if len(base.shape) else 1)
-    here = (levels[0] // 2, levels[1] // 2)
+    here = (start[0], min(start[1], levels[1] - 1))
     found = {here: _SmoothChoice(base, here, None)}
     while True:
         for axis, step in ((0, -1), (0, 1), (1, -1), (1, 1)):
@@ -173,6 +183,26 @@ class _Base:
             problem.radius_m, slope_sigma(problem),
         )  # fmt: skip
 
+    @cached_property
+    def inner(self) -> Indices:
+        """Unknowns whose widths are chosen."""
+        return np.concatenate([group for own in self.groups.values() for group in own])
+
+    @cached_property
+    def outer(self) -> Indices:
+        """All others, depth fields and ball shape among them."""
+        return np.setdiff1d(np.arange(len(self.gradient)), self.inner)
+
+    @cached_property
+    def outer_information(self) -> Array:
+        """The outer unknowns' information, without the priors of depth fields and ball shape."""
+        return self.information[np.ix_(self.outer, self.outer)]
+
+    @cached_property
+    def mixed_information(self) -> Array:
+        """Outer by inner unknowns."""
+        return self.information[np.ix_(self.outer, self.inner)]
+
     def under(self, contacts: Contacts, belief: Belief) -> _Base:
         """The same under a belief on the contacts, which the solution weighs otherwise."""
         expected, off_m, rows = contacts.covariance(belief), contacts.off_m, contacts.rows
@@ -189,10 +219,12 @@ class _Base:
 class _SmoothChoice:
     """All choices of the other widths where depth fields and ball shape have given ones."""
 
-    def __init__(self, base: _Base, levels: tuple[int, int], start: Choice | None) -> None:
+    def __init__(self, base: _Base, levels: tuple[int, int], near: Choice | None) -> None:
         self._base, self.levels = base, levels
         self._field_per_m, self._shape = float(FIELD_LEVELS[levels[0]]), SHAPE_LEVELS[levels[1]]
-        information, gradient = base.information.copy(), base.gradient.copy()
+        self._inner, self._outer = inner, outer = base.inner, base.outer
+        information, mixed = base.outer_information.copy(), base.mixed_information
+        gradient = base.gradient[outer]
         parts = [(index, base.field_precision, self._field_per_m) for index in base.fields]
         if len(base.shape):
             parts.append((base.shape, base.shape_precision, self._shape))
@@ -200,23 +232,22 @@ class _SmoothChoice:
         for index, unit, width in parts:
             precision = unit / width**2
             pull = precision @ base.values[index]
-            information[np.ix_(index, index)] += precision
-            gradient[index] += pull
+            # Such unknowns follow one another among the outer ones, too.
+            start = int(np.searchsorted(outer, index[0]))
+            own = slice(start, start + len(index))
+            information[own, own] += precision
+            gradient[own] += pull
             cost += 0.5 * float(base.values[index] @ pull)
             log_widths += len(index) * float(np.log(width))
-        self._inner = np.concatenate([g for own in base.groups.values() for g in own])
-        self._outer = np.setdiff1d(np.arange(len(gradient)), self._inner)
-        inner, outer = self._inner, self._outer
-        self._factor = cho_factor(information[np.ix_(outer, outer)], lower=True, overwrite_a=True)
-        mixed = information[np.ix_(outer, inner)]
-        right = np.column_stack([mixed, gradient[outer]])
-        solved = cho_solve(self._factor, right)
+        # LAPACK's order of a symmetric matrix: no copy.
+        self._factor = cho_factor(information.T, lower=True, overwrite_a=True, check_finite=False)
+        solved = cho_solve(self._factor, np.column_stack([mixed, gradient]))
         self._response, self._outer_step = -solved[:, :-1], -solved[:, -1]
-        reduced = information[np.ix_(inner, inner)] + mixed.T @ self._response
+        reduced = base.information[np.ix_(inner, inner)] + mixed.T @ self._response
         self._information = 0.5 * (reduced + reduced.T)
-        self._gradient = gradient[inner] + mixed.T @ self._outer_step
+        self._gradient = base.gradient[inner] + mixed.T @ self._outer_step
         log_det = 2.0 * float(np.log(np.diag(self._factor[0])).sum())
-        cost += 0.5 * float(gradient[outer] @ self._outer_step)
+        cost += 0.5 * float(gradient @ self._outer_step)
         self._constant = -cost - 0.5 * log_det
         self._constant -= log_widths
         self._values = base.values[inner]
@@ -229,7 +260,7 @@ class _SmoothChoice:
         self._lens_prior = lens_log_prior(len(base.cameras))
         self._counts = tuple(len(own) for own in self._options)
         self._visited, self._log = np.zeros(0, np.intp), np.zeros(0)
-        self.best = self._search(start)
+        self.best = self._search(near)
 
     def widths(self, choice: Choice) -> Widths:
         """The widths that a choice means."""
@@ -286,11 +317,11 @@ class _SmoothChoice:
             [own[k] for own, k in zip(self._precisions, choices.T, strict=True)], axis=1
         )
 
-    def _search(self, start: Choice | None) -> tuple[Choice, float]:
+    def _search(self, near: Choice | None) -> tuple[Choice, float]:
         """The choice with the largest evidence, from the narrowest, sound and widest priors."""
         ends = [(0,) * len(CLASSES)]
         ends += [tuple(level(name) for name in CLASSES) for level in (sound_level, worst_level)]
-        found = [self._climb(choice) for choice in (ends if start is None else [*ends, start])]
+        found = [self._climb(choice) for choice in (ends if near is None else [*ends, near])]
         return max(found, key=lambda one: one[1])
 
     def _climb(self, choice: Choice) -> tuple[Choice, float]:

@@ -31,7 +31,15 @@ _BASIS = _basis()
 
 def shape_terms(normals: Array) -> Array:
     """n^T E_m n (..., 5) of unit normals (..., 3)."""
-    return np.einsum("...i,mij,...j->...m", normals, _BASIS, normals, optimize=True)
+    x, y, z = normals[..., 0], normals[..., 1], normals[..., 2]
+    across, along = x * x, y * y
+    terms = np.empty((*normals.shape[:-1], SHAPE))
+    terms[..., 0] = (across - along) * np.sqrt(0.5)
+    terms[..., 1] = (2.0 * z * z - across - along) / np.sqrt(6.0)
+    terms[..., 2] = np.sqrt(2.0) * x * y
+    terms[..., 3] = np.sqrt(2.0) * x * z
+    terms[..., 4] = np.sqrt(2.0) * y * z
+    return terms
 
 
 def shape_turn(rotation: Array) -> Array:

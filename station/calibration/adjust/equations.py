@@ -80,15 +80,14 @@ class BallEquations:
         matrix, gradient, mixed = self.matrix[:, :4], self.gradient[:, :4], self.mixed[:, :4]
         inverse = np.linalg.inv(matrix[:, :, :4] + weighed)
         taken = np.swapaxes(matrix, 1, 2) @ inverse
-        half = np.swapaxes(np.linalg.cholesky(inverse), 1, 2) @ mixed
-        flat = half.reshape(4 * len(half), half.shape[-1])
+        root = np.swapaxes(np.linalg.cholesky(inverse), 1, 2)
+        half = (root @ mixed).reshape(4 * len(root), mixed.shape[-1])
         return BallEquations(
             self.matrix - taken @ matrix,
             self.gradient - np.einsum("nij,nj->ni", taken, gradient),
             self.mixed - taken @ mixed,
-            self.theta_matrix - flat.T @ flat,
-            self.theta_gradient
-            - np.einsum("niu,nij,nj->u", mixed, inverse, gradient, optimize=True),
+            self.theta_matrix - half.T @ half,
+            self.theta_gradient - half.T @ (root @ gradient[..., None]).ravel(),
         )
 
     def moved(self, shift: Array) -> BallEquations:

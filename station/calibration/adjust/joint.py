@@ -11,25 +11,28 @@ from station.calibration.adjust.problem import Layout, Problem, State, moved_sta
 from station.calibration.adjust.residuals import FitQuality
 
 _ITERATIONS = 30
-_SETTLED = 0.1
-"""Step in standard deviations."""
 
 
 def solve_joint(
-    problem: Problem, start: State, iterations: int = _ITERATIONS, *, informed: bool = True
-) -> State:
+    problem: Problem, start: State, iterations: int = _ITERATIONS, *, settled: float,
+    informed: bool = True,
+) -> State:  # fmt: skip
     """The most likely state with each detection's deviation; with its information if ``informed``.
 
-    If the measurements are so inconsistent that there is no solution, ``last_step`` is infinite.
+    It has settled once a step, over all unknowns but the path, is shorter than ``settled`` standard
+    deviations. If the measurements are so inconsistent that there is no solution, ``last_step`` is
+    infinite.
     """
     try:
         with np.errstate(over="raise", invalid="raise"):
-            return _settle(problem, start, iterations, informed)
+            return _settle(problem, start, iterations, settled, informed)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return replace(start, last_step=np.inf)
 
 
-def _settle(problem: Problem, start: State, iterations: int, informed: bool) -> State:
+def _settle(
+    problem: Problem, start: State, iterations: int, settled: float, informed: bool
+) -> State:
     layout = Layout.of(problem)
     state, size = start, np.inf
     for _ in range(iterations):
@@ -37,7 +40,7 @@ def _settle(problem: Problem, start: State, iterations: int, informed: bool) -> 
         step, path_step, size = equations.solve()
         state = moved_state(problem, layout, state, step)
         state = replace(state, controls=state.controls + path_step)
-        if size < _SETTLED:
+        if size < settled:
             break
     # The scale applies to the detections only, not to priors and floors.
     fitness = FitQuality.of(problem, state)

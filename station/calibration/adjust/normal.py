@@ -66,7 +66,7 @@ class NormalEquations:
     def solve(self) -> tuple[Array, Array, float]:
         """Steps of the border (m,) and the path (count, 3); the border's in standard deviations."""
         information, gradient = self.reduced()
-        step = np.asarray(-cho_solve(cho_factor(information), gradient))
+        step = np.asarray(-cho_solve(cho_factor(information, check_finite=False), gradient))
         path = -self._band_solve(self._path_gradient + self._coupling.T @ step)
         return step, path.reshape(-1, 3), float(np.sqrt(step @ information @ step))
 

@@ -39,6 +39,9 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _FINE_ITERATIONS = 16
+_COARSELY, _TO_TEST, _FINALLY = 1.0, 0.3, 0.2
+"""Steps, in standard deviations, at which a solution has settled: one that is refined, one that is
+tested and tells the widths, and the one that is used."""
 
 
 def solve(
@@ -105,10 +108,11 @@ def _tested(
     training = acceptance.without_held_out(
         replace(problem, model=COARSE, shape_grid=ROUND), seconds
     )
-    coarse = solve_joint(training, first_state(training, poses), informed=False)
+    coarse = solve_joint(training, first_state(training, poses), settled=_COARSELY, informed=False)
     refusals.check_converged(coarse, refusals.DIVERGED)
     training = replace(training, model=problem.model, shape_grid=problem.shape_grid)
-    tested = solve_joint(training, _refined(coarse, COARSE, problem), _FINE_ITERATIONS)
+    start = _refined(coarse, COARSE, problem)
+    tested = solve_joint(training, start, _FINE_ITERATIONS, settled=_TO_TEST)
     refusals.check_converged(tested, refusals.DIVERGED)
     found = acceptance.compare_held_out(problem, seconds, tested)
     refusals.check_corrected(
@@ -141,7 +145,7 @@ def _final(problem: Problem, training: Problem, tested: State) -> tuple[Problem,
     try:
         problem = replace(problem, widths=most_probable_widths(training, tested))
         start = extended_state(problem, training, tested)
-        state = solve_joint(problem, start, _FINE_ITERATIONS)
+        state = solve_joint(problem, start, _FINE_ITERATIONS, settled=_FINALLY)
         averaged = averaged_state(problem, state)
         if not refusals.converged(state):
             # A wrong height may be what does not let it settle.
