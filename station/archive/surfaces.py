@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from station.core.errors import FormatError
 from station.core.files import read_regular
@@ -82,6 +81,9 @@ def aligned(moving: Surface, target: Surface) -> Surface:
 
 def distances(surface: Surface, other: Surface) -> Array:
     """Signed distance (n,) in metres of each vertex to another surface: positive outside it."""
+    # A fifth of the console's start, which has to be back within seconds.
+    from scipy.spatial import cKDTree
+
     corners = other.vertices[other.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     around = _faces_around(other)
