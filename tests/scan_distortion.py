@@ -41,7 +41,7 @@ class Distortion:
 
 def distortion(booth: SimulatedBooth, rig: Rig, body: Mesh) -> Distortion:
     """A body's points as a calibration places them, against where they are."""
-    normals = _normals(body)
+    normals, areas = _normals(body)
     places, truths, directions, weights = [], [], [], []
     for name, found in rig.cameras.items():
         unit = SimulatedUnit.of(booth, name)
@@ -61,7 +61,7 @@ def distortion(booth: SimulatedBooth, rig: Rig, body: Mesh) -> Distortion:
         places.append(transform(found.world_from_camera, ray / inverse[:, None]))
         truths.append(body.vertices[good])
         directions.append(normals[good])
-        weights.append(facing[good])
+        weights.append(areas[good] * facing[good])
     place, truth = np.concatenate(places), np.concatenate(truths)
     direction, weight = np.concatenate(directions), np.concatenate(weights)
     true_from_found = rigid_fit(truth, place, weight)
@@ -99,10 +99,13 @@ def _girths(truth: Array, direction: Array, weight: Array, off: Array) -> Array:
     return np.array(found)
 
 
-def _normals(body: Mesh) -> Array:
+def _normals(body: Mesh) -> tuple[Array, Array]:
+    """Unit normals (n, 3) of the vertices, and areas (n,) in proportion to theirs: a cloud has no
+    more points of a hand because the mesh has more vertices there."""
     corners = body.vertices[body.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(body.vertices)
     for k in range(3):
         np.add.at(total, body.faces[:, k], across)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+    areas = np.linalg.norm(total, axis=1)
+    return np.asarray(total / np.maximum(areas[:, None], 1e-12)), areas

@@ -139,14 +139,17 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
         if cause.errno == errno.ELOOP:
             raise ValueError("is a link, not a file") from None
         raise
-    with os.fdopen(descriptor, "rb") as stream:
-        status = os.fstat(stream.fileno())
+    try:
+        status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise ValueError("is not a regular file")
         if status.st_size > most_bytes:
             raise ValueError(f"has {status.st_size} bytes, at most {most_bytes} are allowed")
-        # As much as it has, not as much as it may have: room for that would be made at once.
-        return stream.read(status.st_size)
+        with os.fdopen(descriptor, "rb", closefd=False) as stream:
+            # As much as it has, not as much as it may have: room for that would be made at once.
+            return stream.read(status.st_size)
+    finally:
+        os.close(descriptor)
 
 
 def read_bounded_json(path: Path, most_bytes: int) -> Any:

@@ -110,6 +110,20 @@ def test_a_solution_takes_the_ball_that_was_waved(config: Path, store: Calibrati
     assert "station calibrate --new" in str(refused.exception)
 
 
+def test_a_solution_is_of_the_cameras_that_are_configured(
+    config: Path, store: CalibrationStore
+) -> None:
+    """A calibration of four cameras went into use with three in booth.toml."""
+    _begin(store)
+    text = config.read_text()
+    config.write_text(text[: text.rindex("[[cameras]]")])
+    refused = _run(config, "solve")
+    assert isinstance(refused.exception, CalibrationError)
+    assert f"with the cameras {', '.join(CAMERAS)}, and booth.toml has " in str(refused.exception)
+    config.write_text(text + '[[cameras]]\nname = "side"\ndriver = "recorded"\nrecording = "s"\n')
+    assert ", side: put booth.toml right" in str(_run(config, "solve").exception)
+
+
 def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore) -> None:
     _begin(store)
     listed = _run(config, "--list").output

@@ -50,6 +50,14 @@ def test_unreadable_documents_are_named(tmp_path: Path, content: str | None, wor
     assert issubclass(BundleError, FormatError)
 
 
+def test_a_folder_is_no_document(tmp_path: Path) -> None:
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(
+        FormatError, match=r"a\.json cannot be read as JSON \(is not a regular file"
+    ):
+        files.read_json(tmp_path / "a.json", format="x", versions={1})
+
+
 def test_private_files_are_private_whatever_the_mask(tmp_path: Path) -> None:
     mask = os.umask(0)
     try:

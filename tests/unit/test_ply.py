@@ -79,3 +79,14 @@ def test_a_torn_one_is_refused(tmp_path: Path, old: str, new: str) -> None:
         read_triangles(path)
     with pytest.raises(FormatError, match="not a mesh"):
         read_mesh(path)
+
+
+def test_a_file_without_a_head_is_no_ply_file(tmp_path: Path) -> None:
+    """A file that began with the last line was called empty."""
+    path = tmp_path / "mesh.ply"
+    path.write_text("end_header\n1 2 3\n")
+    with pytest.raises(ValueError, match="it is not a PLY file"):
+        read_points(path)
+    path.write_text("")
+    with pytest.raises(ValueError, match="the file is empty"):
+        read_points(path)

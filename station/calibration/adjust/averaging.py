@@ -17,6 +17,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 from scipy.special import logsumexp
 
 from station.calibration.adjust.contacts import Belief, Contacts, beliefs
@@ -294,8 +295,8 @@ class _SmoothChoice:
         carry = np.zeros((size, len(self._inner)))
         carry[self._inner] = np.eye(len(self._inner))
         carry[self._outer] = self._response
-        outer = cho_solve(self._factor, np.eye(len(self._outer)))
-        covariance[np.ix_(self._outer, self._outer)] = 0.5 * (outer + outer.T)
+        half = np.tril(dpotri(self._factor[0], lower=True)[0])
+        covariance[np.ix_(self._outer, self._outer)] = half + np.tril(half, -1).T
         return step, covariance + carry @ inner @ carry.T
 
     def _precision(self, name: str, option: Option) -> Array:

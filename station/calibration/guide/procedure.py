@@ -224,6 +224,7 @@ class Procedure(Attempt):
         from station.calibration.solve.solving import solve
 
         session = self.session()
+        session.check_configured([camera.name for camera in self.config.cameras])
         session.check_radius(self.config.calibrate.ball_radius_m)
         self.guide.title("Solution")
         solution = solve(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -71,6 +71,19 @@ class Seen:
                     f"when this calibration was started ({self.started}); start again with "
                     "station calibrate --new"
                 )
+
+    def check_configured(self, names: Collection[str]) -> None:
+        """Refuse to solve for other cameras than the booth has.
+
+        Raises:
+            CalibrationError: with both sets of cameras.
+        """
+        if set(names) != set(self.cameras):
+            raise CalibrationError(
+                f"this calibration was started ({self.started}) with the cameras "
+                f"{', '.join(self.cameras)}, and booth.toml has {', '.join(names)}: put booth.toml "
+                "right, or start again with station calibrate --new"
+            )
 
     def check_radius(self, radius_m: float) -> None:
         """Refuse to mix what was seen of two different balls.
