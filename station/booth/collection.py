@@ -79,7 +79,8 @@ def too_slow_words(count: int, wanted: int, within_s: float, tolerance_s: float)
         tolerance_s: widest spread of a frameset. Cameras take their pictures when they like: the
             nearest of another one is up to half a frame away.
     """
-    needed_s = wanted / FRAME_RATE_HZ
+    # The first comes up to a frame late.
+    needed_s = (wanted + 1) / FRAME_RATE_HZ
     if needed_s > within_s:
         return (
             f"{wanted} pictures of a scan take {needed_s:.1f} s, and it may take {within_s:g} s: "

@@ -114,6 +114,8 @@ class _Terminated(SystemExit):
 
 
 def _terminate(*_: object) -> None:
+    # A second signal must not end what cleans up after the first.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise _Terminated
 
 

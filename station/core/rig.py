@@ -44,6 +44,16 @@ class PredictedError:
     tilt_sigma_rad: float
     """The world's vertical."""
 
+    def widened(self, off_m: float) -> PredictedError:
+        """The same with another error, of this standard deviation along an axis, of where cameras
+        see a body; a camera sees half of a girth."""
+        return PredictedError(
+            float(np.hypot(self.height_sigma_m, off_m)),
+            float(np.hypot(self.girth_sigma_m, np.pi * off_m)),
+            float(np.hypot(self.normal_rms_m, off_m)),
+            self.tilt_sigma_rad,
+        )
+
     def to_json(self) -> dict[str, float]:
         return {
             "height_sigma_m": self.height_sigma_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
@@ -13,6 +14,7 @@ import click
 from station.calibration.detect.step_names import EMPTY
 from station.core.commands import Number, writable_folder
 from station.core.errors import InputError
+from station.core.service import die_with_parent
 from station.sensors.recording import RecordedFrame, write_recording
 from station.simulation.procedure import STRIDE, VirtualProcedure
 from station.simulation.scene import fixed_posts, load_mesh
@@ -120,11 +122,16 @@ def record_virtual(
                 )
     # Spawned: a forked child would share the ray caster's threads.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(_PROCESSES, mp_context=context) as pool:
+    ending = partial(die_with_parent, os.getpid())
+    pool = ProcessPoolExecutor(_PROCESSES, mp_context=context, initializer=ending)
+    try:
         click.echo(f"rendering {len(jobs)} recordings, {_PROCESSES} at a time")
         running = {pool.submit(job): what for what, job in jobs.items()}
         for done, job in enumerate(as_completed(running), 1):
             click.echo(f"{done:3} of {len(jobs)}: {running[job]}, {job.result()} frames")
+    finally:
+        # Who ends the command does not wait for what is being rendered.
+        pool.shutdown(wait=False, cancel_futures=True)
     lines = ["# A virtual booth: four replayed Kinects.", ""]
     for name in booth.rig.cameras:
         lines += ["[[cameras]]", f'name = "{name}"', f'driver = "{driver}"']

@@ -54,6 +54,9 @@ def test_errors_of_another_form_are_found(switch: str) -> None:
     assert found.normal_rms_mm < 0.6
     assert abs(found.height_mm) < 2.5
     assert np.abs(found.girths_mm).max() < 5.0
+    predicted = solution.rig.predicted
+    assert predicted is not None
+    assert 0.5 < found.normal_rms_mm / (1e3 * predicted.normal_rms_m) < 1.5
 
 
 def test_what_it_says_of_its_own_errors_is_true() -> None:

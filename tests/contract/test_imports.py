@@ -155,9 +155,13 @@ def test_open3d_stays_out_of_the_capture_processes() -> None:
     assert offenders == []
 
 
-@pytest.mark.parametrize("module", ["station.booth.capture", "station.cli", "workers.cli"])
+@pytest.mark.parametrize(
+    "module",
+    ["station.booth.capture", "station.cli", "station.console.server", "workers.cli"],
+)
 def test_a_light_process_stays_light(module: str) -> None:
-    """open3d is 0.5 s and 230 MB: four capture processes cannot each carry it."""
+    """open3d is 0.5 s and 230 MB: four capture processes cannot each carry it, and the console is
+    back within seconds."""
     program = f"import sys, {module}; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

@@ -121,7 +121,7 @@ def test_a_solution_is_of_the_cameras_that_are_configured(
     assert isinstance(refused.exception, CalibrationError)
     assert f"with the cameras {', '.join(CAMERAS)}, and booth.toml has " in str(refused.exception)
     config.write_text(text + '[[cameras]]\nname = "side"\ndriver = "recorded"\nrecording = "s"\n')
-    assert ", side: put booth.toml right" in str(_run(config, "solve").exception)
+    assert ", side; put booth.toml right" in str(_run(config, "solve").exception)
 
 
 def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore) -> None:

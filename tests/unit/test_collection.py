@@ -16,6 +16,7 @@ _ORDER = Order(scan_id_of("a"), "", 1e9)
     [
         (10, 0.025, "stop other programs"),
         (10, 0.0001, "sync.tolerance_s"),
+        (90, 0.025, "raise scan.max_duration_s in booth.toml, or lower scan.framesets"),
         (100, 0.025, "raise scan.max_duration_s in booth.toml, or lower scan.framesets"),
     ],
 )

@@ -90,3 +90,5 @@ def test_a_file_without_a_head_is_no_ply_file(tmp_path: Path) -> None:
     path.write_text("")
     with pytest.raises(ValueError, match="the file is empty"):
         read_points(path)
+    path.write_text(_HEAD.replace("ply\n", "ply\ncomment end_header\n", 1) + _BODY)
+    assert len(read_points(path)[0]) == 3

@@ -63,12 +63,10 @@ def test_offsets_within_their_own_noise_widen_nothing() -> None:
 
 def test_offsets_beyond_their_noise_widen_what_is_said() -> None:
     found = widen_by_test(SAID, {name: _held_out(2e-3) for name in "ab"})
-    unknown_m2 = (2e-3**2 - RMS_M**2 / SECONDS) / 6.0
-    factor = np.sqrt(1.0 + unknown_m2 / SAID.normal_rms_m**2)
-    assert factor > 1.5
-    assert found.height_sigma_m == pytest.approx(factor * SAID.height_sigma_m)
-    assert found.girth_sigma_m == pytest.approx(factor * SAID.girth_sigma_m)
-    assert found.normal_rms_m == pytest.approx(factor * SAID.normal_rms_m)
+    unknown_m = np.sqrt((2e-3**2 - RMS_M**2 / SECONDS) / 6.0)
+    assert found.height_sigma_m == pytest.approx(np.hypot(unknown_m, SAID.height_sigma_m))
+    assert found.girth_sigma_m == pytest.approx(np.hypot(np.pi * unknown_m, SAID.girth_sigma_m))
+    assert found.normal_rms_m == pytest.approx(np.hypot(unknown_m, SAID.normal_rms_m))
     assert found.tilt_sigma_rad == SAID.tilt_sigma_rad
 
 

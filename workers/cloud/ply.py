@@ -79,8 +79,8 @@ def read_triangles(path: Path) -> tuple[Array, NDArray[np.int32]]:
 
 def _parted(path: Path) -> tuple[str, list[_Element], bytes]:
     """Byte order (empty for text), elements, and what follows the head."""
-    head, end, body = read_regular(path.resolve(), MAX_BYTES).partition(b"end_header")
-    if not head and not end:
+    head, end, body = read_regular(path.resolve(), MAX_BYTES).partition(b"\nend_header")
+    if not head:
         raise ValueError("the file is empty")
     lines = [line.split() for line in head.decode("ascii", errors="replace").split("\n")]
     if not end or lines[0] != ["ply"] or len(lines) < 2:

@@ -63,7 +63,7 @@ _MIDDLE = len(FIELD_LEVELS) // 2, len(SHAPE_LEVELS) // 2
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    best = _smooth_choices(_Base.of(problem, state), _MIDDLE)[0]
+    best = _smooth_choices(_Base.of(problem, state), _MIDDLE, None)[0]
     return best.widths(best.best[0])
 
 
@@ -74,7 +74,8 @@ def averaged_state(problem: Problem, state: State) -> State:
     sure, *doubtful = beliefs(problem)
     mixture, base = Mixture(layout.size), _Base.of(problem, state)
     smooth = []
-    for one in _smooth_choices(base.under(contacts, sure), _smooth_levels(problem.widths)):
+    levels, choice = _smooth_levels(problem.widths), _choice_of(problem.widths)
+    for one in _smooth_choices(base.under(contacts, sure), levels, choice):
         if _add(mixture, sure, one):
             smooth.append((one.levels, one.best[0]))
     for belief in doubtful:
@@ -110,15 +111,27 @@ def _smooth_levels(widths: Widths) -> tuple[int, int]:
     )
 
 
-def _smooth_choices(base: _Base, start: tuple[int, int]) -> list[_SmoothChoice]:
+def _choice_of(widths: Widths) -> Choice:
+    """The options that make up these widths."""
+    sensors = list(widths.sensors.values())
+    levels = [*zip(*sensors, strict=True), (widths.radius,), (widths.bow,)]
+    return tuple(
+        [option.levels for option in width_options(name, len(sensors))].index(own)
+        for name, own in zip(CLASSES, levels, strict=True)
+    )
+
+
+def _smooth_choices(
+    base: _Base, start: tuple[int, int], choice: Choice | None
+) -> list[_SmoothChoice]:
     """The evidence for levels of depth fields and ball shape, climbed from ``start``; the largest
     first.
 
-    Each search goes on from the best choice of the level before.
+    Each search goes on from the best choice of the level before, the first from ``choice``.
     """
     levels = (len(FIELD_LEVELS), len(SHAPE_LEVELS) if len(base.shape) else 1)
     here = (start[0], min(start[1], levels[1] - 1))
-    found = {here: _SmoothChoice(base, here, None)}
+    found = {here: _SmoothChoice(base, here, choice)}
     while True:
         for axis, step in ((0, -1), (0, 1), (1, -1), (1, 1)):
             near = (here[0] + step * (axis == 0), here[1] + step * (axis == 1))

@@ -28,6 +28,8 @@ _FEWEST_PATCHES = 3
 """Fewer do not make a plane."""
 _NEAREST_M, _FARTHEST_M = 0.1, 20.0
 """Ends of what any depth camera measures."""
+_LEAST_VARIANCE = 1e-18
+"""1/m2, of a patch: nanometres at 1 m."""
 _RADIUS_CERTAIN = 0.045
 """Largest standard deviation of a detection's own radius, as a share of the radius, ..."""
 _COVERED_CERTAIN, _COVERED = 0.034, 1.1
@@ -205,8 +207,8 @@ def _check_patches(patches: Array) -> None:
     inverse, variance = patches[:, 2], patches[:, 3]
     if np.any(inverse < 1.0 / _FARTHEST_M) or np.any(inverse > 1.0 / _NEAREST_M):
         raise ValueError(f"depths lie between {_NEAREST_M:g} and {_FARTHEST_M:g} m")
-    if np.any(variance <= 0.0) or np.any(variance > 1.0 / _NEAREST_M**2):
-        raise ValueError("the variance of an inverse depth is above 0 and finite")
+    if np.any(variance < _LEAST_VARIANCE) or np.any(variance > 1.0 / _NEAREST_M**2):
+        raise ValueError("no sensor has such a variance of an inverse depth")
 
 
 def _rounded(patches: Array) -> list[list[float]]:

@@ -105,10 +105,7 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
             f"camera {', '.join(missing)}; calibrate with station calibrate"
         )
     if others := [name for name in scene if name not in names]:
-        click.echo(
-            f"camera {', '.join(others)} is calibrated but not in booth.toml: not looked at",
-            err=True,
-        )
+        click.echo(f"not in booth.toml, and not looked at: camera {', '.join(others)}", err=True)
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
         taken = _look(feed, names, quiet)

@@ -133,13 +133,7 @@ def corrected(rig: Rig, drift: Drift, created: str) -> Rig:
     predicted = rig.predicted
     if predicted is not None:
         off_m = _sigma_at_mark(moved.world_from_camera, drift.covariance)
-        # A camera sees half of a girth.
-        predicted = replace(
-            predicted,
-            height_sigma_m=float(np.hypot(predicted.height_sigma_m, off_m)),
-            girth_sigma_m=float(np.hypot(predicted.girth_sigma_m, np.pi * off_m)),
-            normal_rms_m=float(np.hypot(predicted.normal_rms_m, off_m)),
-        )
+        predicted = predicted.widened(off_m)
     cameras = {**rig.cameras, drift.camera: moved}
     return replace(rig, created=created, cameras=cameras, predicted=predicted)
 

@@ -53,6 +53,7 @@ class Procedure(Attempt):
                 "them into use, station calibrate --new begins another"
             )
         if session is not None:
+            session.check_configured([camera.name for camera in self.config.cameras])
             self.guide.say(
                 f"continuing the calibration that was started at {session.started}; if a camera "
                 "was moved since, begin anew: station calibrate --new"

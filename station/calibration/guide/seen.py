@@ -81,7 +81,7 @@ class Seen:
         if set(names) != set(self.cameras):
             raise CalibrationError(
                 f"this calibration was started ({self.started}) with the cameras "
-                f"{', '.join(self.cameras)}, and booth.toml has {', '.join(names)}: put booth.toml "
+                f"{', '.join(self.cameras)}, and booth.toml has {', '.join(names)}; put booth.toml "
                 "right, or start again with station calibrate --new"
             )
 

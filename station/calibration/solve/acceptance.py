@@ -124,14 +124,7 @@ def widen_by_test(predicted: PredictedError, found: Mapping[str, HeldOut]) -> Pr
         (float(one.mean_m @ one.mean_m) - one.rms_m**2 / _independent(one)) / 6.0
         for one in found.values()
     ]
-    unknown_m2 = max(0.0, float(np.mean(excess)))
-    factor = float(np.sqrt(1.0 + unknown_m2 / predicted.normal_rms_m**2))
-    return PredictedError(
-        factor * predicted.height_sigma_m,
-        factor * predicted.girth_sigma_m,
-        factor * predicted.normal_rms_m,
-        predicted.tilt_sigma_rad,
-    )
+    return predicted.widened(float(np.sqrt(max(0.0, sum(excess) / len(excess)))))
 
 
 def _independent(one: HeldOut) -> float:

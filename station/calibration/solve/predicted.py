@@ -77,7 +77,9 @@ def predict_errors(
     whole = _not_rigid(np.concatenate(merged), np.concatenate(rigid))
     rings = np.split(whole, np.cumsum([len(rows) for rows in merged])[:-1])
     girths = [sigma(rows.mean(axis=0)) for rows in rings[: len(_GIRTHS_M)]]
-    crown = surely_seen(_Ring(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]), 0.0))
+    crown = surely_seen(
+        _Ring(np.array([[0.0, 0.0, _CROWN_M]]), np.array([[0.0, 0.0, 1.0]]), np.ones(1))
+    )
     limbs = [_Ring.around(_HEAD_HEIGHT_M, *_HEAD_M)]
     for height_m, beside_m, radius_m in _ARMS_M:
         limbs += [_Ring.around(height_m, radius_m, radius_m, x) for x in (-beside_m, beside_m)]
@@ -100,8 +102,8 @@ class _Ring:
     """(n, 3)"""
     normals: Array
     """(n, 3)"""
-    size: float
-    """By how much of the body's surface it counts, up to a factor."""
+    arc: Array
+    """(n,): by how much of the body's surface each counts, up to a factor."""
 
     @classmethod
     def around(
@@ -113,7 +115,8 @@ class _Ring:
         length = np.hypot(half_width_m * nx, half_depth_m * ny)
         x, y = half_width_m**2 * nx / length, half_depth_m**2 * ny / length
         points = np.stack([x_m + x, y, np.full(_AROUND, height_m)], axis=1)
-        return cls(points, np.stack([nx, ny, np.zeros(_AROUND)], axis=1), float(length.mean()))
+        arc = (half_width_m * half_depth_m) ** 2 / length**3
+        return cls(points, np.stack([nx, ny, np.zeros(_AROUND)], axis=1), arc)
 
     @property
     def rigid(self) -> Array:
@@ -156,7 +159,7 @@ def _cloud_rms(views: Sequence[_View], covariance: Array) -> float:
 
     A camera's cloud has the more points of a place the more this faces it.
     """
-    weight = np.concatenate([view.ring.size * view.weight for view in views])
+    weight = np.concatenate([view.ring.arc[view.place] * view.weight for view in views])
     root = np.sqrt(weight)[:, None]
     rigid = np.concatenate([view.ring.rigid[view.place] for view in views])
     rows = _not_rigid(root * np.concatenate([view.rows for view in views]), root * rigid)

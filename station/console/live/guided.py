@@ -95,6 +95,8 @@ def run(config_path: Path, step: str, new: bool) -> None:
         with store.locked():
             if new:
                 store.set_aside()
+            if step not in ("all", "solve"):
+                procedure.tell_of_replay()
             _do(procedure, step)
     except KeyboardInterrupt:
         raise CalibrationError(f"stopped; {procedure.kept()}") from None
