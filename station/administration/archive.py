@@ -27,6 +27,7 @@ _DATABASE = ".sqlite"
 _JOURNAL_ENDS = (f"{_DATABASE}-wal", f"{_DATABASE}-shm")
 _UNFINISHED = ".tmp"
 _MODE = 0o600
+_MOST_RESTORES = 100
 _SCRATCH = ("tmp", "locks")
 """Folders of a spool that mean nothing without the processes that use them."""
 
@@ -147,17 +148,28 @@ def check(backup: Path) -> list[str]:
     return [str(name) for name in manifest["parts"]]
 
 
-def restore_part(backup: Path, one: Part) -> None:
-    """Restore a part completely or not at all; what it replaces is kept beside it."""
+def restore_part(backup: Path, one: Part) -> Path | None:
+    """Restore a part completely or not at all; returns where what it replaces is kept."""
     fresh = one.place.with_name(f".{one.place.name}.restored")
     _remove(fresh)
     _copy(backup / CONTENT / one.name, fresh)
+    old = None
     if one.place.exists():
-        old = one.place.with_name(f".{one.place.name}.before-restore")
-        _remove(old)
+        old = _free_place(one.place)
         one.place.rename(old)
     fresh.rename(one.place)
     fsync_folder(one.place.parent)
+    return old
+
+
+def _free_place(place: Path) -> Path:
+    """A place for what a backup replaces; what was kept before stays."""
+    numbers = ("", *(f"-{number}" for number in range(2, _MOST_RESTORES)))
+    for number in numbers:
+        free = place.with_name(f".{place.name}.before-restore{number}")
+        if not free.exists():
+            return free
+    raise BoothError(f"too much is kept beside {place} (.before-restore); delete some of it")
 
 
 def sha256(path: Path) -> str:

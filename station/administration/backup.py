@@ -11,7 +11,6 @@ from station.administration import units
 from station.administration.archive import check, save
 from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
-from station.core.errors import BoothError
 
 
 @click.command()
@@ -31,11 +30,11 @@ def backup(folder: Path, config_path: Path | None, with_scans: bool) -> None:
       station backup /media/usb --with-scans
     """
     path = find_config(config_path).resolve()
-    if with_scans and units.running():
-        raise BoothError(
-            "scans change while the booth is running; first run: systemctl stop booth.target"
-        )
-    saved, count = save(folder, path, load_config(path), with_scans=with_scans)
+    config = load_config(path)
+    if with_scans:
+        # Scans change while the booth is running.
+        units.check_stopped(config.runtime.folder)
+    saved, count = save(folder, path, config, with_scans=with_scans)
     check(saved)
     click.echo(f"{saved}: {count} files, read back and verified")
     if not with_scans:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import shlex
 import shutil
 import subprocess
 import sys
@@ -127,7 +128,7 @@ def _set_up(
         click.echo("the booth is running and will start with the machine")
         streaming = subprocess.run([_COMMAND, "start"], check=False).returncode == 0
     left = [] if streaming else ["remove the cause of the error above, then run: station start"]
-    return left + _what_is_left(config, installed=installed, started=start and installed)
+    return left + _what_is_left(config, path, started=start and installed)
 
 
 def _find(
@@ -248,8 +249,10 @@ def compare_sensors(named: Sequence[str], connected: Sequence[str]) -> list[str]
     return left
 
 
-def _what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> list[str]:
+def _what_is_left(config: BoothConfig, path: Path, *, started: bool) -> list[str]:
     left: list[str] = []
+    installed = path == CONFIG
+    named = "" if find_config(None).resolve() == path else f" --config {shlex.quote(str(path))}"
     physical = [c.serial for c in config.cameras if isinstance(c, FreenectCamera) and c.serial]
     if physical:
         left += compare_sensors(physical, serial_numbers())
@@ -262,8 +265,9 @@ def _what_is_left(config: BoothConfig, *, installed: bool, started: bool) -> lis
             "unplug one camera after another and check in `station status` that the right one "
             "goes silent; if not, run station setup --replace --camera NAME=SERIAL"
         )
-    if not config.calibration.exists():
-        left.append("station calibrate")
     if not started:
-        left.append("systemctl enable --now booth.target" if installed else "station run")
+        left.append("systemctl enable --now booth.target" if installed else f"station run{named}")
+    if not config.calibration.exists():
+        beside = "" if installed else ", in another terminal"
+        left.append(f"station calibrate{named}{beside}")
     return left

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 
 from station.core.errors import BoothError
+from station.core.files import is_held
+from station.core.service import STATION_LOCK
 
 TARGET = "booth.target"
 _STOPPING_S = 30.0
@@ -36,6 +38,18 @@ def running() -> bool:
             break
         time.sleep(0.1)
     return bool(busy)
+
+
+def check_stopped(runtime_folder: Path) -> None:
+    """Refuse what a running booth would spoil.
+
+    Raises:
+        BoothError: its services are up, or `station run` is.
+    """
+    if running():
+        raise BoothError("the booth is running; first run: systemctl stop booth.target")
+    if is_held(runtime_folder / STATION_LOCK):
+        raise BoothError("the booth is running (station run); first end it: Ctrl-C in its terminal")
 
 
 def start(*, afresh: bool) -> None:

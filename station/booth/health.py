@@ -62,6 +62,8 @@ def booth_health(config: BoothConfig) -> BoothHealth:
         if reports(content)
         for problem in content.get("problems", [])
     ]
+    if reports(processes["sync"]) and not config.calibration.exists():
+        problems.append("the booth is not calibrated, and takes no scans: run station calibrate")
     problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)

@@ -21,8 +21,9 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import new_scan_id, scan_id_of
+from station.core.service import STATION_LOCK
 from station.messaging.messages import Request
-from station.messaging.transport import STATION_LOCK, NoAnswerError, ask
+from station.messaging.transport import NoAnswerError, ask
 
 _POLL_S = 0.05
 _EXIT_RESCAN = 3
@@ -131,6 +132,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
         content = _command(config, Request("status"))
     except BoothError as problem:
         error, content = problem, {**asdict(booth_health(config)), "streaming": None}
+        if starting(content["processes"]):
+            error = BoothError("the booth is starting; try again in a few seconds")
     if as_json:
         click.echo(json.dumps(content))
     else:
@@ -262,6 +265,8 @@ def _follow(
         words = _WORDS.get(state, state)
         if state == "capturing" and session["wanted"]:
             words += f" ({session['framesets']} of {session['wanted']})"
+            if session["framesets"] >= session["wanted"]:
+                words = "pictures taken: the person may move; storing"
         if session["reason"] == UNSURE:
             words = UNSURE
         if words != told:

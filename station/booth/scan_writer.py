@@ -146,6 +146,11 @@ class ScanWriter:
         rig = Rig.load(self._config.calibration)
         for name in self._names:
             rig.camera(name, str(self._config.calibration))
+        if others := [name for name in rig.cameras if name not in self._names]:
+            raise CalibrationError(
+                f"camera {', '.join(others)} was calibrated and is not in booth.toml: put it "
+                "back, or calibrate the booth again"
+            )
         note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
         spool.notes.write(note, durable=False)
         if order.late(time.monotonic()):

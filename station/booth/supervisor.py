@@ -24,8 +24,8 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import held, private_folder
-from station.core.service import die_with_parent, file_name, stop_event
-from station.messaging.transport import STATION_LOCK, socket_folder
+from station.core.service import STATION_LOCK, die_with_parent, file_name, stop_event
+from station.messaging.transport import socket_folder
 
 WATCHDOG_S = 10.0
 """As in the systemd units. A main loop's longest step is far below a second."""

@@ -31,6 +31,8 @@ from station.core.files import held, private_folder, read_bounded_json
 
 CACHE_VARIABLE = "BOOTH_CACHE"
 """Names the folder of all caches; the user's cache folder if unset."""
+STATION_LOCK = "station.lock"
+"""Held by `station run` in the runtime folder."""
 HEALTH = "health"
 _CODE = Path(__file__).parent
 _NUMBA_VARIABLE = "NUMBA_CACHE_DIR"

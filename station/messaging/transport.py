@@ -11,6 +11,7 @@ import zmq
 
 from station.core.errors import BoothError
 from station.core.files import PRIVATE_FILE_MODE, is_held, private_folder
+from station.core.service import STATION_LOCK
 from station.messaging.messages import Reply, Request
 from station.messaging.topics import TOPICS
 
@@ -20,8 +21,6 @@ _LONGEST_PATH = 100
 _SHORT = Path("/tmp")
 """The same for all: an operator's TMPDIR may be another than the station's."""
 MAX_MESSAGE_BYTES = 16 << 20
-STATION_LOCK = "station.lock"
-"""Held by `station run` in the runtime folder."""
 _PATIENCE_S = 15.0
 """Within this a process that hangs is restarted."""
 

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from station.administration.archive import parts, save
+from station.administration.backup import backup
 from station.administration.booth_file import administration, booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
 from station.administration.migrate import MIGRATIONS, VERSION, migrate
@@ -21,7 +22,9 @@ from station.administration.setup import compare_sensors, setup
 from station.core import bundle, rig
 from station.core.config_file import load_config
 from station.core.errors import BoothError, ConfigError, FormatError
+from station.core.files import held
 from station.core.rig import Rig
+from station.core.service import STATION_LOCK
 from station.sensors.freenect import FreenectCamera
 from station.sensors.recording import check_recording
 
@@ -209,6 +212,24 @@ def test_restoring_keeps_what_it_replaces(booth: Path, tmp_path: Path) -> None:
     assert calibration.read_text() == "{}"
     old = calibration.with_name(".calibration.json.before-restore")
     assert old.read_text() == '{"newer": true}'
+    calibration.write_text('{"newest": true}')
+    again = _run(restore, saved, "--config", booth)
+    assert old.read_text() == '{"newer": true}'
+    second = old.with_name(f"{old.name}-2")
+    assert second.read_text() == '{"newest": true}'
+    assert str(second) in again
+
+
+def test_a_booth_in_a_terminal_is_running_too(booth: Path, tmp_path: Path) -> None:
+    """A running one was restored, and scans went to where nobody looks."""
+    saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
+    runtime = load_config(booth).runtime.folder
+    runtime.mkdir(parents=True, exist_ok=True)
+    with held(runtime / STATION_LOCK, BoothError("held")):
+        with pytest.raises(BoothError, match=r"the booth is running \(station run\)"):
+            _run(restore, saved, "--config", booth)
+        with pytest.raises(BoothError, match=r"the booth is running \(station run\)"):
+            _run(backup, tmp_path / "usb", "--with-scans", "--config", booth)
 
 
 def test_a_database_is_saved_while_it_is_written(booth: Path, tmp_path: Path) -> None:

@@ -160,7 +160,9 @@ def test_a_step_says_what_comes_next(
 ) -> None:
     """After the empty booth, which begins another calibration, solve was named, and refused."""
     session = _begin(store)
-    session.balls += balls * [ball(next(iter(CAMERAS)), 0.0)]
+    seen = balls * [ball(next(iter(CAMERAS)), 0.0)]
+    session.balls += seen
+    session.mark += seen
     monkeypatch.setattr(Procedure, "empty", lambda _: None)
     monkeypatch.setattr(Procedure, "unfinished_session", lambda _: session)
     done = _run(config, "floor")

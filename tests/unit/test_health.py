@@ -28,6 +28,7 @@ def config(tmp_path: Path) -> BoothConfig:
         for name in _CAMERAS
     )
     (tmp_path / "booth.toml").write_text(f"{cameras}[console]\nenabled = false\n")
+    (tmp_path / "calibration.json").touch()
     return load_config(tmp_path / "booth.toml")
 
 
@@ -55,6 +56,13 @@ def test_a_silent_camera_is_named_once_the_sensors_are_started(config: BoothConf
     [problem] = _problems(config, streaming=True, silent=["a"], cameras=cameras)
     assert problem.startswith("camera a sends no frames (no such device)")
     assert _problems(config, streaming=False, silent=["a"], cameras=cameras) == []
+
+
+def test_a_booth_that_is_not_calibrated_says_so(config: BoothConfig) -> None:
+    """It was only said to the person who stood in it."""
+    config.calibration.unlink()
+    [problem] = _problems(config, streaming=True, silent=[], cameras={})
+    assert problem.endswith("takes no scans: run station calibrate")
 
 
 def test_the_remedy_of_several_silent_cameras_is_said_once(config: BoothConfig) -> None:

@@ -70,7 +70,7 @@ class Attempt:
         # The empty booth begins another calibration where none is being done.
         following = (
             solving
-            if session is not None and session.balls
+            if session is not None and session.balls and session.mark
             else "station calibrate goes through the steps that are missing"
         )
         return f"kept, and not in use yet: {following}"
