@@ -149,8 +149,9 @@ def _show_status(content: Mapping[str, Any]) -> None:
     if any(content["processes"].values()):
         click.echo(f"  {'process':<22} {'state':<10} last report")
         begun = starting(content["processes"])
+        silent = "SILENT" if any(map(reports, content["processes"].values())) else "stopped"
         for name, told in content["processes"].items():
-            words = "running" if reports(told) else "SILENT"
+            words = "running" if reports(told) else silent
             age = f"{told['age_s']:.0f} s ago" if told else "never"
             if name in begun:
                 words, age = "starting", ""

@@ -229,6 +229,8 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         removed = _purge_label(spool, str(label))
     for folder in removed:
         click.echo(f"removed {folder}")
+    if not removed:
+        click.echo("nothing is past its retention period")
     # Labels leave the index together with the scans, not at the next query.
     ScanIndex(spool).find(limit=0)
 

@@ -96,7 +96,7 @@ def record_virtual(
       station record-virtual --body station/simulation/bodies/ann.npz --out demo/booth
       station run --config demo/booth/booth.toml
       station record-virtual --out demo/empty
-      station record-virtual --body ann.npz --out demo/booth --calibration 60
+      station record-virtual --body person.ply --out demo/booth --calibration 60
       station calibrate --config demo/booth/booth.toml --recordings demo/booth/procedure
     """
     if hanging and waving_s is None:

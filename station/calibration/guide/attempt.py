@@ -53,7 +53,7 @@ class Attempt:
                 "no calibration has been started; station calibrate goes through all steps"
                 if last is None
                 else f"the last calibration, {last}, is finished; station calibrate begins "
-                "another, and a single step (ball, around, stand, depth) adds to it"
+                "another, and a single step (ball, mark, around, stand, depth) adds to it"
             )
         return session
 
