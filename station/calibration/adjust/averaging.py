@@ -10,8 +10,8 @@ that the covariance includes the uncertainty about the widths.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import replace
+from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -21,17 +21,9 @@ from scipy.linalg.lapack import dpotri
 from scipy.special import logsumexp
 
 from station.calibration.adjust.contacts import Belief, Contacts, beliefs
-from station.calibration.adjust.diagonal import evidence_changes
 from station.calibration.adjust.mixture import Mixture
-from station.calibration.adjust.priors import priors, shape_precision, slope_sigma
-from station.calibration.adjust.problem import (
-    Doubt,
-    Indices,
-    Layout,
-    Problem,
-    State,
-    moved_state,
-)
+from station.calibration.adjust.problem import Doubt, Layout, Problem, State, moved_state
+from station.calibration.adjust.quadratic import Quadratic, evidence_changes
 from station.calibration.adjust.widths import (
     BOW,
     BOW_TOLERANCE,
@@ -63,7 +55,7 @@ _MIDDLE = len(FIELD_LEVELS) // 2, len(SHAPE_LEVELS) // 2
 
 def most_probable_widths(problem: Problem, state: State) -> Widths:
     """The widths with the largest evidence, from the information and gradient of a state."""
-    best = _smooth_choices(_Base.of(problem, state), _MIDDLE, None)[0]
+    best = _smooth_choices(Quadratic.of(problem, state), _MIDDLE, None)[0]
     return best.widths(best.best[0])
 
 
@@ -72,7 +64,7 @@ def averaged_state(problem: Problem, state: State) -> State:
     layout = Layout.of(problem)
     contacts = Contacts.of(problem, layout, state)
     sure, *doubtful = beliefs(problem)
-    mixture, base = Mixture(layout.size), _Base.of(problem, state)
+    mixture, base = Mixture(layout.size), Quadratic.of(problem, state)
     smooth = []
     levels, choice = _smooth_levels(problem.widths), _choice_of(problem.widths)
     for one in _smooth_choices(base.under(contacts, sure), levels, choice):
@@ -122,7 +114,7 @@ def _choice_of(widths: Widths) -> Choice:
 
 
 def _smooth_choices(
-    base: _Base, start: tuple[int, int], choice: Choice | None
+    base: Quadratic, start: tuple[int, int], choice: Choice | None
 ) -> list[_SmoothChoice]:
     """The evidence for levels of depth fields and ball shape, climbed from ``start``; the largest
     first.
@@ -143,97 +135,10 @@ def _smooth_choices(
         here = best
 
 
-@dataclass(frozen=True)
-class _Base:
-    """The quadratic about a state without its uncertain priors."""
-
-    cameras: tuple[str, ...]
-    information: Array
-    gradient: Array
-    values: Array
-    """(m,) deviations of the unknowns from their prior means."""
-    groups: dict[str, list[Indices]]
-    """Unknowns of each class, one group a camera, or a single one."""
-    fields: list[Indices]
-    field_precision: Array
-    shape: Indices
-    shape_precision: Array
-    radius_m: float
-    slope_sigma: Array
-    """(9,) that a sloping floor adds to its bow."""
-    log_belief: float = 0.0
-    """Log-probability of a belief and of what it says of the contacts at the state."""
-
-    @classmethod
-    def of(cls, problem: Problem, state: State) -> _Base:
-        layout, model = Layout.of(problem), problem.model
-        information, gradient = state.information.copy(), state.gradient.copy()
-        values = np.zeros(layout.size)
-        for prior in priors(problem, layout, state):
-            values[prior.index] = prior.values
-        groups: dict[str, list[Indices]] = {name: [] for name in CLASSES}
-        fields = []
-        for name in problem.cameras:
-            index = layout.sensor(name)
-            gain, focal, cx, cy, k1, flat = index[model.widths_at]
-            members = ((gain,), (focal,), (cx, cy), (k1,), (flat,))
-            for group, of_group in zip(SENSOR, members, strict=True):
-                groups[group].append(np.array(of_group))
-            fields.append(index[model.field_start :])
-        groups[RADIUS], groups[BOW] = [layout.radius], [layout.bow]
-        certain = np.setdiff1d(
-            np.arange(layout.size),
-            np.concatenate([*(g for own in groups.values() for g in own), *fields, layout.shapes]),
-        )
-        kept = np.isin(np.arange(layout.size), certain)
-        for prior in priors(problem, layout, state):
-            uncertain = ~kept[prior.index]
-            block = prior.information * uncertain[:, None] * uncertain
-            information[np.ix_(prior.index, prior.index)] -= block
-            gradient[prior.index] -= block @ prior.values
-        return cls(
-            tuple(problem.cameras), information, gradient, values, groups, fields,
-            model.field_precision, layout.shapes, shape_precision(problem, layout),
-            problem.radius_m, slope_sigma(problem),
-        )  # fmt: skip
-
-    @cached_property
-    def inner(self) -> Indices:
-        """Unknowns whose widths are chosen."""
-        return np.concatenate([group for own in self.groups.values() for group in own])
-
-    @cached_property
-    def outer(self) -> Indices:
-        """All others, depth fields and ball shape among them."""
-        return np.setdiff1d(np.arange(len(self.gradient)), self.inner)
-
-    @cached_property
-    def outer_information(self) -> Array:
-        """The outer unknowns' information, without the priors of depth fields and ball shape."""
-        return self.information[np.ix_(self.outer, self.outer)]
-
-    @cached_property
-    def mixed_information(self) -> Array:
-        """Outer by inner unknowns."""
-        return self.information[np.ix_(self.outer, self.inner)]
-
-    def under(self, contacts: Contacts, belief: Belief) -> _Base:
-        """The same under a belief on the contacts, which the solution weighs otherwise."""
-        expected, off_m, rows = contacts.covariance(belief), contacts.off_m, contacts.rows
-        weight = np.linalg.inv(expected)
-        log = float(np.log(belief.probability)) - 0.5 * float(np.linalg.slogdet(expected)[1])
-        return replace(
-            self,
-            information=self.information + rows.T @ (weight - np.diag(contacts.weight)) @ rows,
-            gradient=self.gradient + rows.T @ (weight @ off_m - contacts.weight * off_m),
-            log_belief=log - 0.5 * float(off_m @ weight @ off_m),
-        )
-
-
 class _SmoothChoice:
     """All choices of the other widths where depth fields and ball shape have given ones."""
 
-    def __init__(self, base: _Base, levels: tuple[int, int], near: Choice | None) -> None:
+    def __init__(self, base: Quadratic, levels: tuple[int, int], near: Choice | None) -> None:
         self._base, self.levels = base, levels
         self._field_per_m, self._shape = float(FIELD_LEVELS[levels[0]]), SHAPE_LEVELS[levels[1]]
         self._inner, self._outer = inner, outer = base.inner, base.outer

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.adjust.diagonal import evidence_changes
+from station.calibration.adjust.quadratic import evidence_changes
 
 Array = NDArray[np.float64]
 
