@@ -79,9 +79,11 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     seen = Session.load(tmp_path)
     assert seen.runs == 2
     assert len(seen.balls) == 80
-    before = [ball for ball in seen.balls if ball.time_s < 2.45]
-    assert len(before) == 50
+    before, after = seen.balls[:50], seen.balls[50:]
+    assert max(ball.time_s for ball in before) < 2.45
     assert sum(ball.camera == _CAMERAS[0] for ball in before) == 25
+    # How late the other camera's follow depends on which were found first.
+    assert min(ball.time_s for ball in after if ball.camera == _CAMERAS[0]) > 2.45
     seen.end_replay("a recording")
     assert Session.load(tmp_path).replayed == "a recording"
     # Another run that was begun, and stopped, shows less than all.
