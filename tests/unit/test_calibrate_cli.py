@@ -148,21 +148,26 @@ def test_a_step_that_is_stopped_says_what_is_kept(
 
 
 @pytest.mark.parametrize(
-    ("balls", "following"),
-    [(0, "goes through the steps that are missing"), (1, "solve puts it into use")],
+    ("balls", "marked", "following"),
+    [
+        (0, 0, "goes through the steps that are missing"),
+        (1, 0, "goes through the steps that are missing"),
+        (1, 1, "solve puts it into use"),
+    ],
 )
 def test_a_step_says_what_comes_next(
     config: Path,
     store: CalibrationStore,
     monkeypatch: pytest.MonkeyPatch,
     balls: int,
+    marked: int,
     following: str,
 ) -> None:
     """After the empty booth, which begins another calibration, solve was named, and refused."""
     session = _begin(store)
-    seen = balls * [ball(next(iter(CAMERAS)), 0.0)]
-    session.balls += seen
-    session.mark += seen
+    seen = [ball(next(iter(CAMERAS)), 0.0)]
+    session.balls += balls * seen
+    session.mark += marked * seen
     monkeypatch.setattr(Procedure, "empty", lambda _: None)
     monkeypatch.setattr(Procedure, "unfinished_session", lambda _: session)
     done = _run(config, "floor")

@@ -66,14 +66,14 @@ def averaged_state(problem: Problem, state: State) -> State:
     sure, *doubtful = beliefs(problem)
     mixture, base = Mixture(layout.size), Quadratic.of(problem, state)
     smooth = []
-    levels, choice = _smooth_levels(problem.widths), _choice_of(problem.widths)
-    for one in _smooth_choices(base.under(contacts, sure), levels, choice):
+    start = _smooth_levels(problem.widths), _choice_of(problem.widths)
+    for one in _smooth_choices(base.under(contacts, sure), *start):
         if _add(mixture, sure, one):
             smooth.append((one.levels, one.best[0]))
     for belief in doubtful:
         doubted = base.under(contacts, belief)
-        for levels, start in smooth:
-            _add(mixture, belief, _SmoothChoice(doubted, levels, start))
+        for levels, choice in smooth:
+            _add(mixture, belief, _SmoothChoice(doubted, levels, choice))
     doubts = []
     for belief in doubtful:
         probability, step = mixture.share(belief)

@@ -91,16 +91,17 @@ def run(config_path: Path, step: str, new: bool) -> None:
     store = CalibrationStore(config.calibrate.folder, config.calibration)
     guide = PageGuide(recordings is None, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)
+    alone = step not in ("all", "solve")
     try:
         with store.locked():
             if new:
                 store.set_aside()
-            if step not in ("all", "solve"):
+            if alone:
                 procedure.tell_of_replay()
             _do(procedure, step)
     except KeyboardInterrupt:
         raise CalibrationError(f"stopped; {procedure.kept()}") from None
-    if step not in ("all", "solve"):
+    if alone:
         guide.say(procedure.following("the computation puts it into use"))
 
 
