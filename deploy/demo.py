@@ -24,6 +24,7 @@ from station.simulation.record_cli import PROCEDURE, TRUTH
 BODY = Path(__file__).parents[1] / "station/simulation/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
 WAVING_S = 24
+_STARTS_S = 60.0
 
 
 def main() -> int:
@@ -98,7 +99,8 @@ def compare(found: Rig, truth: Rig) -> None:
 
 def _wait_for_control(environment: dict[str, str]) -> None:
     """Wait until the station responds."""
-    for _ in range(10):
+    deadline_s = time.monotonic() + _STARTS_S
+    while time.monotonic() < deadline_s:
         answer = subprocess.run(
             [*STATION, "status"], env=environment, capture_output=True, check=False
         )

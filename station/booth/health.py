@@ -17,7 +17,7 @@ from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
 from station.core.scans import STATES, count_scans
-from station.core.service import read_health
+from station.core.service import NOTHING_RUNS, anything_runs, read_health
 
 MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""
@@ -32,7 +32,8 @@ class BoothHealth:
     """The booth at one moment."""
 
     processes: dict[str, dict[str, Any]]
-    """Last report of each process, with `age_s`; {} for a process without a report."""
+    """Last report of each process, with `age_s`; {} for a process without a report, and for all of
+    a booth that does not run."""
     sync: dict[str, Any]
     """Cameras, framesets and latencies; {"error"} while sync does not report."""
     spool: dict[str, int]
@@ -48,7 +49,12 @@ class BoothHealth:
 def booth_health(config: BoothConfig) -> BoothHealth:
     """The booth as it is now; what cannot be read is a problem of its own."""
     folder = config.runtime.folder
-    processes = {service.name: read_health(folder, service.name) for service in services(config)}
+    # Reports of a booth that was stopped a moment ago are as fresh as those of one that runs.
+    runs = anything_runs(folder)
+    processes = {
+        service.name: read_health(folder, service.name) if runs else {}
+        for service in services(config)
+    }
     problems = _silent(processes)
     sync = processes["sync"]
     if not reports(sync):
@@ -86,10 +92,7 @@ def starting(processes: Mapping[str, Mapping[str, Any]]) -> set[str]:
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
     if not any(map(reports, processes.values())):
-        return [
-            "no process of the booth is running here; start it with: station run, or an installed "
-            "booth with: sudo systemctl start booth.target"
-        ]
+        return [NOTHING_RUNS]
     begun = starting(processes)
     return [
         f"the {name} process has not reported for {content['age_s']:.0f} s; it is restarted "

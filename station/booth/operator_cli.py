@@ -21,7 +21,7 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import new_scan_id, scan_id_of
-from station.core.service import STATION_LOCK
+from station.core.service import NOTHING_RUNS, STATION_LOCK
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError, ask
 
@@ -176,7 +176,8 @@ def _show_status(content: Mapping[str, Any]) -> None:
         f"spool: {', '.join(f'{n} {state}' for state, n in counts.items()) or 'empty'}{free}"
     )
     for problem in content["problems"]:
-        click.echo(f"! {problem}")
+        if problem != NOTHING_RUNS:  # told as the error
+            click.echo(f"! {problem}")
 
 
 @click.command()
@@ -318,6 +319,7 @@ def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]
             if not told:
                 click.echo(f"  {UNSURE}", err=True)
             told = True
+            time.sleep(_POLL_S)
 
 
 def _text(label: str) -> str:

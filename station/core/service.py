@@ -27,12 +27,17 @@ from typing import Any
 import platformdirs
 
 from station.core.errors import BoothError
-from station.core.files import held, private_folder, read_bounded_json
+from station.core.files import entries_of, held, is_held, private_folder, read_bounded_json
 
 CACHE_VARIABLE = "BOOTH_CACHE"
 """Names the folder of all caches; the user's cache folder if unset."""
-STATION_LOCK = "station.lock"
+_LOCK = ".lock"
+STATION_LOCK = f"station{_LOCK}"
 """Held by `station run` in the runtime folder."""
+NOTHING_RUNS = (
+    "no process of the booth is running here; start it with: station run, or an installed booth "
+    "with: sudo systemctl start booth.target"
+)
 HEALTH = "health"
 _CODE = Path(__file__).parent
 _NUMBA_VARIABLE = "NUMBA_CACHE_DIR"
@@ -84,7 +89,7 @@ def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]
     Raises:
         BoothError: it is already running.
     """
-    lock = runtime_folder / f"{file_name(process)}.lock"
+    lock = runtime_folder / f"{file_name(process)}{_LOCK}"
     busy = BoothError(f"a {process} process is already running here ({lock}); end it first")
     with held(lock, busy):
         return_freed_memory()
@@ -234,6 +239,15 @@ class Heartbeat:
             with contextlib.suppress(OSError):
                 temporary.write_text(json.dumps(self._content))
                 temporary.replace(self._path)
+
+
+def anything_runs(runtime_folder: Path) -> bool:
+    """Whether a process of the booth runs, or the supervisor that starts them.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    return any(path.suffix == _LOCK and is_held(path) for path in entries_of(runtime_folder))
 
 
 def file_name(process: str) -> str:

@@ -11,7 +11,7 @@ import zmq
 
 from station.core.errors import BoothError
 from station.core.files import PRIVATE_FILE_MODE, is_held, private_folder
-from station.core.service import STATION_LOCK
+from station.core.service import NOTHING_RUNS, STATION_LOCK, anything_runs
 from station.messaging.messages import Reply, Request
 from station.messaging.topics import TOPICS
 
@@ -27,6 +27,13 @@ _PATIENCE_S = 15.0
 
 class NoAnswerError(BoothError):
     """A process did not answer in time; it may carry out the request anyway."""
+
+
+class NothingRunsError(NoAnswerError):
+    """No process of the booth runs: nobody received the request."""
+
+    def __init__(self) -> None:
+        super().__init__(NOTHING_RUNS)
 
 
 def endpoint(runtime_folder: Path, name: str) -> str:
@@ -115,14 +122,18 @@ def subscriber(
 
 
 def ask(runtime_folder: Path, name: str, request: Request, timeout_s: float) -> Reply:
-    """Send a request and wait for its reply.
+    """Send a request and wait for its reply; a process that is starting is waited for.
 
     Raises:
+        NothingRunsError: at once, where no process of the booth runs.
         NoAnswerError: nobody answered in time.
     """
+    address = endpoint(runtime_folder, name)
+    if not anything_runs(runtime_folder):
+        raise NothingRunsError
     with zmq.Context() as context, _socket(context, zmq.REQ, 4) as socket:
         socket.set(zmq.RCVTIMEO, int(1000 * timeout_s))
-        socket.connect(endpoint(runtime_folder, name))
+        socket.connect(address)
         try:
             socket.send(request.pack())
             return Reply.unpack(socket.recv())

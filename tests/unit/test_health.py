@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,26 @@ from station.booth.health import MAX_AGE_S, booth_health, starting
 from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
-from station.core.service import HEALTH, file_name
+from station.core.errors import BoothError
+from station.core.files import held
+from station.core.service import HEALTH, STATION_LOCK, file_name
 from station.sensors.freenect import FreenectCamera
 
 _CAMERAS = ("a", "b")
 
 
 @pytest.fixture
-def config(tmp_path: Path) -> BoothConfig:
+def config(tmp_path: Path) -> Iterator[BoothConfig]:
+    """A booth that `station run` runs."""
     cameras = "".join(
         f'[[cameras]]\nname = "{name}"\ndriver = "recorded"\nrecording = "{name}"\n'
         for name in _CAMERAS
     )
     (tmp_path / "booth.toml").write_text(f"{cameras}[console]\nenabled = false\n")
     (tmp_path / "calibration.json").touch()
-    return load_config(tmp_path / "booth.toml")
+    config = load_config(tmp_path / "booth.toml")
+    with held(config.runtime.folder / STATION_LOCK, BoothError("held")):
+        yield config
 
 
 def _tell(config: BoothConfig, process: str, age_s: float = 0.0, **content: Any) -> None:

@@ -1,13 +1,19 @@
-"""Output of `station scan`."""
+"""Output of the operator's commands."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
+from click.testing import CliRunner, Result
 
-from station.booth.operator_cli import show_result
-from station.core.errors import FormatError
+from station.booth.operator_cli import cancel, scan, show_result, start, status, stop
+from station.core.config import BoothConfig
+from station.core.errors import BoothError, FormatError
+from station.core.files import held
+from station.core.service import HEALTH, STATION_LOCK
 
 
 def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
@@ -47,3 +53,46 @@ def test_a_result_whose_table_is_damaged_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "measurements.json").write_text("{")
     with pytest.raises(FormatError, match="damaged"):
         show_result(tmp_path)
+
+
+def _run(command: click.Command, config: BoothConfig, *words: str) -> Result:
+    path = config.runtime.folder.parent / "booth.toml"
+    return CliRunner().invoke(command, [*words, "--config", str(path)])
+
+
+def _report(config: BoothConfig, process: str, **content: Any) -> None:
+    """The report that a process wrote just now."""
+    folder = config.runtime.folder / HEALTH
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {"told_s": time.monotonic(), **content}
+    (folder / f"{process}.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("command", [status, scan, start, stop, cancel])
+def test_a_booth_that_does_not_run_is_told_at_once(
+    one_camera: BoothConfig, command: click.Command
+) -> None:
+    """Every command waited for five seconds first."""
+    began_s = time.monotonic()
+    words = ["some-scan"] if command is cancel else []
+    done = _run(command, one_camera, *words)
+    assert time.monotonic() - began_s < 0.5 * one_camera.runtime.command_timeout_s
+    assert isinstance(done.exception, BoothError)
+    assert str(done.exception).startswith("no process of the booth is running here; start it with")
+
+
+def test_a_booth_that_was_just_stopped_has_no_processes(one_camera: BoothConfig) -> None:
+    """Their last reports are as fresh as those of a booth that runs."""
+    for process in ("control", "sync"):
+        _report(one_camera, process)
+    shown = _run(status, one_camera).output
+    assert "running" not in shown
+    assert "SILENT" not in shown
+
+
+def test_a_booth_that_is_starting_is_waited_for(one_camera: BoothConfig) -> None:
+    path = one_camera.runtime.folder.parent / "booth.toml"
+    path.write_text(path.read_text() + "[runtime]\ncommand_timeout_s = 0.2\n")
+    with held(one_camera.runtime.folder / STATION_LOCK, BoothError("held")):
+        done = _run(stop, one_camera)
+    assert "did not answer within 0.2 s" in str(done.exception)
