@@ -89,6 +89,31 @@ def test_stored_calibrations_are_listed_and_put_into_use(
     assert "20261101T100000Z, 20261102T100000Z" in str(wrong.exception)
 
 
+def test_a_calibration_of_other_cameras_is_not_put_into_use(
+    config: Path, store: CalibrationStore
+) -> None:
+    """It went into use without a word, and every scan was refused."""
+    _begin(store)
+    name = store.finish(replace(default_rig(), created="2026-11-01T10:00:00Z"), {}).name
+    text = config.read_text()
+    config.write_text(text.replace('name = "front-lower"', 'name = "side"'))
+    refused = _run(config, "--use", name)
+    assert isinstance(refused.exception, CalibrationError)
+    assert f"{name} is of the cameras {', '.join(CAMERAS)}, and booth.toml has" in str(
+        refused.exception
+    )
+    section = 'name = "front-lower"\ndriver = "recorded"\n'
+    config.write_text(text.replace(section, f'{section}serial = "A1"\n'))
+    refused = _run(config, "--use", name)
+    then = CAMERAS["front-lower"].serial
+    assert f"camera front-lower was sensor {then} at calibration {name}, and booth.toml has A1" in (
+        str(refused.exception)
+    )
+    assert not store.in_use.exists()
+    config.write_text(text.replace(section, f'{section}serial = "{then}"\n'))
+    assert _run(config, "--use", name).exit_code == 0
+
+
 def test_after_a_finished_calibration_solve_says_so(config: Path, store: CalibrationStore) -> None:
     """It once said that none had been begun, an hour after the operator had done all steps."""
     _begin(store)

@@ -126,7 +126,7 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
     if list_them:
         _list(procedure)
     elif use_name:
-        entry = procedure.store.use(use_name)
+        entry = procedure.store.use(use_name, procedure.config.cameras)
         click.echo(f"calibration {entry.name} is in use: {procedure.store.in_use}")
     else:
         if procedure.recordings is not None:

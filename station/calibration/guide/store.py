@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 
 from station.calibration.detect.scene import StaticView
 from station.calibration.guide.session import SCENE, SESSION, Session
+from station.core.drivers import CameraConfig
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import (
     entries_of,
@@ -29,6 +31,7 @@ from station.core.files import (
     write_json,
 )
 from station.core.rig import Rig
+from station.sensors.base import is_serial
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
 _log = logging.getLogger(__name__)
@@ -145,13 +148,18 @@ class CalibrationStore:
         fsync_folder(self.folder)
         return aside
 
-    def use(self, name: str) -> Entry:
+    def use(self, name: str, cameras: Sequence[CameraConfig] = ()) -> Entry:
         """Make a stored calibration the one that the booth reads.
 
         A calibration.json that came from elsewhere is put into the store first.
 
+        Args:
+            name: its date.
+            cameras: the booth's; where they are given, a calibration of others is refused.
+
         Raises:
-            CalibrationError: there is none of that name; names those that there are.
+            CalibrationError: there is none of that name; names those that there are. Or it is of
+                other cameras.
         """
         # A damaged one must not stand in the way of the others.
         folders = {folder.name: folder for folder in self._folders()}
@@ -159,6 +167,8 @@ class CalibrationStore:
             known = ", ".join(folders) or "none"
             raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
         rig = Rig.load(folders[name] / CALIBRATION)
+        if cameras:
+            _check_cameras(name, rig, cameras)
         if self.in_use.exists() and not any(map(self._is_used, folders.values())):
             self._adopt()
         write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
@@ -189,6 +199,29 @@ class CalibrationStore:
                 views = [path for path in entries_of(folder / SCENE) if path.suffix == ".npz"]
                 return {path.stem: StaticView.load(path, sizes.get(path.stem)) for path in views}
         return {}
+
+
+def _check_cameras(calibration: str, rig: Rig, cameras: Sequence[CameraConfig]) -> None:
+    """Refuse a calibration of other cameras, or other sensors, than booth.toml names.
+
+    Raises:
+        CalibrationError: naming both.
+    """
+    remedy = "put booth.toml right, or calibrate the booth with station calibrate --new"
+    names = [camera.name for camera in cameras]
+    if set(names) != set(rig.cameras):
+        raise CalibrationError(
+            f"calibration {calibration} is of the cameras {', '.join(rig.cameras)}, and booth.toml "
+            f"has {', '.join(names)}: {remedy}"
+        )
+    for camera in cameras:
+        # Not every driver's cameras have serial numbers.
+        now, then = str(getattr(camera, "serial", "")), rig.cameras[camera.name].serial
+        if is_serial(now) and is_serial(then) and now != then:
+            raise CalibrationError(
+                f"camera {camera.name} was sensor {then} at calibration {calibration}, and "
+                f"booth.toml has {now}: {remedy}"
+            )
 
 
 def dated(created: str) -> str:

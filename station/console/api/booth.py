@@ -214,7 +214,7 @@ def use(name: str, console: Booth, caller: Manager) -> Calibration:
     """Put a stored calibration into use."""
     _known(console, name)
     console.audit.note(caller.name, caller.address, "use a calibration")
-    return _calibration(_store(console).use(name))
+    return _calibration(_store(console).use(name, console.config.cameras))
 
 
 @router.get(
