@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from seen_balls import ball
 
 from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.swing import LOOK_S, whole_swings
@@ -89,6 +90,26 @@ def test_what_is_still_looked_at_belongs_to_the_run_it_was_seen_in(
     # Another run that was begun, and stopped, shows less than all.
     seen.begin_run()
     assert not Session.load(tmp_path).replayed
+
+
+@pytest.mark.parametrize("again_seen", [False, True])
+def test_what_was_seen_before_is_kept_until_it_is_seen_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, again_seen: bool
+) -> None:
+    """A step that was begun again, and stopped at once, lost all that was waved before."""
+
+    def find(*args: Any, **_: Any) -> BallDetection | None:
+        return ball(args[1].name, args[3]) if again_seen else None
+
+    monkeypatch.setattr(finder, "find_ball", find)
+    rig = default_rig().cameras
+    session = Session.begin(tmp_path, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    session.begin_run()
+    session.record_balls([ball(_CAMERAS[0], 0.1 * number) for number in range(7)])
+    feed = cast(Feed, _Frames(moments=20, reset_at=20))
+    guide = Guide(attended=False, countdown_s=0.0)
+    wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0, again=True)
+    assert len(Session.load(tmp_path).balls) == (40 if again_seen else 7)
 
 
 def test_an_operator_is_told_when_what_he_sees_lags(

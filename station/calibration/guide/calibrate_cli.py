@@ -175,7 +175,9 @@ def floor(procedure: Procedure) -> None:
 
 
 @calibrate.command("ball")
-@click.option("--again", is_flag=True, help="discard the earlier recordings of the ball")
+@click.option(
+    "--again", is_flag=True, help="discard what was seen of the ball before, once it is seen anew"
+)
 @_step
 def ball(procedure: Procedure, again: bool) -> None:
     """Wave the ball; what is seen is added to what was seen before.

@@ -130,11 +130,15 @@ class Procedure(Attempt):
         )
         with self.feed(BALL) as (feed, session):
             self.remark_on_ghosts(session)
-            # A recording begins anew: what it shows twice was seen once.
-            if session.balls and (again or self.recordings is not None):
-                session.forget_balls()
-            reference, lasts_s = self.config.reference, wanted.waving_s
-            wave_ball(feed, session, self.guide, reference=reference, lasts_s=lasts_s)
+            wave_ball(
+                feed,
+                session,
+                self.guide,
+                reference=self.config.reference,
+                lasts_s=wanted.waving_s,
+                # A recording begins anew: what it shows twice was seen once.
+                again=bool(session.balls) and (again or self.recordings is not None),
+            )
             if self.recordings is not None:
                 session.end_replay(fingerprint(step_folder(self.recordings, BALL)))
         if len(session.balls) > _SURE_OF_RADIUS:

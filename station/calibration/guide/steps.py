@@ -224,15 +224,23 @@ def coverage_so_far(seen: Seen, reference: str) -> Coverage:
 
 
 def wave_ball(
-    feed: Feed, session: Session, guide: Guide, *, reference: str, lasts_s: float
+    feed: Feed,
+    session: Session,
+    guide: Guide,
+    *,
+    reference: str,
+    lasts_s: float,
+    again: bool = False,
 ) -> None:
     """Keep the ball on its way through the booth, until the time is over and it is enough.
 
     What was seen is on disk within a second, whatever ends the step. Seconds in which the ball was
-    seen before count.
+    seen before count; ``again``: all that was seen before is forgotten once it is seen anew.
     """
-    coverage = coverage_so_far(session, reference)
-    lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
+    coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
+    if not again:
+        coverage = coverage_so_far(session, reference)
+        lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
     session.begin_run()
     resets: dict[str, int] = {}
     waiting: list[BallDetection] = []
@@ -243,9 +251,13 @@ def wave_ball(
         waiting.extend(balls)
 
     def write() -> None:
+        nonlocal again
         # Emptied first: whatever interrupts the writing, nothing is written twice.
         seen = list(waiting)
         waiting.clear()
+        if again and seen:
+            again = False
+            session.forget_balls()
         session.record_balls(seen)
 
     began_s = written_s = time.monotonic()
@@ -282,6 +294,8 @@ def wave_ball(
     guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
+    if again:
+        guide.say("nothing replaces what was seen of the ball before, which is kept")
     if not coverage.enough:
         guide.say(f"more positions would help: {coverage.advice()}")
 
