@@ -155,6 +155,19 @@ def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore)
     assert listed == "  unfinished, started 2026-11-21T10:00:00Z: nothing yet\n"
 
 
+def test_calibrations_that_were_given_up_are_listed(config: Path, store: CalibrationStore) -> None:
+    """Nothing but the folder's name told of them."""
+    for _ in range(10):
+        session = _begin(store)
+        store.set_aside()
+    # One that was killed while it began has nothing that could be listed.
+    session.folder.mkdir()
+    store.set_aside()
+    lines = _run(config, "--list").output.splitlines()
+    assert lines[0] == "  abandoned-1  given up, started 2026-11-21T10:00:00Z: nothing yet"
+    assert [line.split()[0] for line in lines] == [f"abandoned-{n}" for n in range(1, 11)]
+
+
 @pytest.mark.parametrize(("balls", "kept"), [(0, "nothing was recorded"), (1, "what was seen is")])
 def test_a_step_that_is_stopped_says_what_is_kept(
     config: Path, store: CalibrationStore, monkeypatch: pytest.MonkeyPatch, balls: int, kept: str

@@ -19,6 +19,7 @@ from station.core.errors import CalibrationError
 # several on a busy station.
 if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
+    from station.calibration.guide.session import Session
 
 
 _SIDE = Number(0.001, 1.0, unit="metres")
@@ -140,7 +141,8 @@ def _list(procedure: Procedure) -> None:
     from station.calibration.solve.refusals import SIGMAS_95
 
     entries, session = list(procedure.store.entries()), procedure.unfinished_session()
-    if not entries and session is None:
+    given_up = procedure.store.given_up()
+    if not entries and not given_up and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
         mark = "*" if entry.in_use else " "
@@ -154,9 +156,16 @@ def _list(procedure: Procedure) -> None:
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms{accuracy}"
         )
+    for other in given_up:
+        click.echo(f"  {other.folder.name}  {_begun('given up', other)}")
     if session is not None:
-        origin = f", added to {session.adds_to}" if session.adds_to else ""
-        click.echo(f"  unfinished, started {session.started}{origin}: {session.summary()}")
+        click.echo(f"  {_begun('unfinished', session)}")
+
+
+def _begun(state: str, session: Session) -> str:
+    """Words on a calibration that is not solved."""
+    origin = f", added to {session.adds_to}" if session.adds_to else ""
+    return f"{state}, started {session.started}{origin}: {session.summary()}"
 
 
 @calibrate.command("floor")

@@ -83,6 +83,20 @@ class CalibrationStore:
             found.append(Entry(folder.name, folder, rig, self._is_used(folder)))
         return found
 
+    def given_up(self) -> list[Session]:
+        """Calibrations that were set aside before they were solved, in that order.
+
+        One that was killed while it began has no session: nothing was seen in it.
+        """
+        found = []
+        begun = [path.parent for path in self.folder.glob(f"{_ABANDONED}*/{SESSION}")]
+        for folder in sorted(begun, key=lambda folder: (len(folder.name), folder.name)):
+            try:
+                found.append(Session.load(folder))
+            except FormatError as cause:
+                _log.warning("  %s  cannot be read: %s", folder.name, cause)
+        return found
+
     def name_in_use(self) -> str:
         """Name of the calibration that the booth reads; empty if it is none of the stored ones."""
         return next((folder.name for folder in self._folders() if self._is_used(folder)), "")
