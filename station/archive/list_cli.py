@@ -104,5 +104,6 @@ def _line(scan: ScanRecord) -> str:
     taken = scan.created.replace("T", " ").removesuffix("Z")
     # A label is arbitrary text: control characters must not reach the terminal.
     label = "".join(c if c.isprintable() else "?" for c in scan.label) or "-"
-    reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons else ""
-    return f"{scan.scan_id:<24} {taken}  {_WORDS[scan.state]:<14} {label}{reasons}"
+    outcome = "cancelled" if scan.cancelled else _WORDS[scan.state]
+    reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons and not scan.cancelled else ""
+    return f"{scan.scan_id:<24} {taken}  {outcome:<14} {label}{reasons}"

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from station.core.scans import REASON
+from station.core.scans import CANCELLED, REASON
 from station.core.spool import Spool
 
 ScanState = Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]
@@ -38,6 +38,11 @@ class ScanRecord:
     reasons: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Duration of each step of the reconstruction."""
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it failed because the operator cancelled it."""
+        return self.state == "failed" and self.reasons == (CANCELLED,)
 
     @property
     def verdict(self) -> str:

@@ -35,7 +35,6 @@ import zmq
 from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
 from station.booth.session import (
-    CANCELLED,
     MAX_LABEL_LENGTH,
     UNSURE,
     Session,
@@ -47,7 +46,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import private_folder, write_json
-from station.core.scans import ScanId, ScanNote, boot_id, failure_reason, scan_id_of
+from station.core.scans import CANCELLED, ScanId, ScanNote, boot_id, failure_reason, scan_id_of
 from station.core.service import Heartbeat, die_with_parent, only_process, stop_event
 from station.core.spool import Spool
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent

@@ -20,7 +20,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
-from station.core.scans import new_scan_id, scan_id_of
+from station.core.scans import CANCELLED, new_scan_id, scan_id_of
 from station.core.service import NOTHING_RUNS, STATION_LOCK
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError, ask
@@ -216,6 +216,8 @@ def scan(
             f"scan {scan_id} continues without this command; see its state with: station find "
             f"{scan_id}; cancel it with: station cancel {scan_id}"
         ) from None
+    if session["reason"] == CANCELLED:
+        raise BoothError(f"scan {scan_id} was {CANCELLED}")
     if session["state"] == "failed":
         raise BoothError(f"scan {scan_id} failed: {session['reason']}")
     if not wait:

@@ -19,8 +19,6 @@ from station.core.scans import ScanNote
 State = Literal["armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"]
 FINAL: frozenset[State] = frozenset({"delivered", "rescan", "failed"})
 ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered", "rescan"})
-CANCELLED = "cancelled by the operator"
-"""Reason of a scan that failed because it was cancelled."""
 UNSURE = "outcome not known yet; do not scan again"
 MAX_LABEL_LENGTH = 200
 """Characters; a note of a scan is read up to a limit."""

@@ -24,7 +24,6 @@ from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
 from station.booth.live import LiveCloud, frameset_points, is_empty
 from station.booth.scan_writer import Ended, ScanWriter, Started
-from station.booth.session import CANCELLED
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import NOBODY
@@ -33,7 +32,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.rig import Rig
-from station.core.scans import ScanId, scan_id_of
+from station.core.scans import CANCELLED, ScanId, scan_id_of
 from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.intake import FrameIntake, LiveFrame
 from station.messaging.messages import Reply, Request, ScanEvent

@@ -51,6 +51,8 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 STATES = ("queue", "work", "outbox", "failed", "done")
 REASON = "reason.json"
+CANCELLED = "cancelled by the operator"
+"""Reason of a scan that failed because it was cancelled."""
 _BUNDLE_BYTES = 40 << 20
 """Larger than a bundle of forty depth frames."""
 _FILES = 200

@@ -17,7 +17,7 @@ from station.archive.records import ScanRecord
 from station.booth.retention import purge
 from station.cli import station
 from station.core.files import write_json
-from station.core.scans import REASON
+from station.core.scans import CANCELLED, REASON
 from station.core.spool import Spool
 
 
@@ -187,6 +187,18 @@ def test_list_and_find_on_the_command_line(spool: Spool) -> None:
     found = CliRunner().invoke(station, ["find", "order 1234", "--json", *option])
     assert [scan["scan_id"] for scan in json.loads(found.output)] == ["20261121T100000Z-0001"]
     assert "no scan matches 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
+
+
+def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:
+    """It was said to have failed, as if something had gone wrong."""
+    scan_id = "20261120T100000Z-0000"
+    assert spool.withdraw(scan_id, CANCELLED)
+    option = _booth(spool)
+    (line,) = CliRunner().invoke(station, ["find", scan_id, *option]).output.splitlines()
+    assert "cancelled" in line
+    assert "failed" not in line
+    found = json.loads(CliRunner().invoke(station, ["find", scan_id, "--json", *option]).output)
+    assert (found[0]["state"], found[0]["reasons"]) == ("failed", [CANCELLED])
 
 
 def test_a_list_since_what_is_no_day_is_refused(spool: Spool) -> None:

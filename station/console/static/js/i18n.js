@@ -47,6 +47,12 @@ export function t(key, values = {}) {
   return text.replace(/\{(\w+)\}/g, (_, name) => String(values[name] ?? ''));
 }
 
+// A cancelled scan counts as failed, but nothing went wrong.
+export function outcome(scan) {
+  const cancelled = scan.state === 'failed' && scan.reasons[0] === 'cancelled by the operator';
+  return cancelled ? 'cancelled' : scan.state;
+}
+
 export function currentLanguage() { return language; }
 
 export function setLanguage(value) { store('language', value); }

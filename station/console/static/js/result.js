@@ -2,15 +2,16 @@
 
 import { address, bytes, get } from './api.js';
 import { h, notice, segmented } from './dom.js';
-import { currentLanguage, said, t, time } from './i18n.js';
+import { currentLanguage, outcome, said, t, time } from './i18n.js';
 import { readPly } from './ply.js';
 import { choose, digits, settings } from './settings.js';
 
 const LOOKS = { ok: 'good', rescan: 'warn', failed: 'bad' };
 
 export function verdictChip(scan) {
-  const look = LOOKS[scan.verdict] ?? '';
-  return h('span', { className: `chip ${look}` }, t(`state.${scan.state}`));
+  const ended = outcome(scan);
+  const look = ended === 'cancelled' ? '' : LOOKS[scan.verdict] ?? '';
+  return h('span', { className: `chip ${look}` }, t(`state.${ended}`));
 }
 
 export async function result(main, session, scanId) {

@@ -5,7 +5,7 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { said, t, time } from './i18n.js';
+import { outcome, said, t, time } from './i18n.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
@@ -143,6 +143,7 @@ export async function scan(main, session) {
     const done = current;
     const seconds = ((performance.now() - pressed) / 1000).toFixed(1);
     const figure = bodyFigure();
+    const cancelled = outcome(done) === 'cancelled';
     const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
     const again = h('button', { id: 'again', className: look === 'ok' ? '' : 'primary', onclick: begin }, t('scan.again'));
     again.addEventListener('click', () => { again.disabled = true; });
@@ -150,8 +151,8 @@ export async function scan(main, session) {
       done.state === 'failed' ? '' : h('p', { className: 'leave', id: 'leave' }, t('scan.leave')),
       h('div', { className: `verdict ${look}`, id: 'verdict', 'data-verdict': look },
         figure,
-        h('div', {}, h('h2', {}, t(`scan.${look}`)), h('p', {}, done.label || t('result.noLabel')),
-          done.reasons.length ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
+        h('div', {}, h('h2', {}, t(`scan.${cancelled ? 'cancelled' : look}`)), h('p', {}, done.label || t('result.noLabel')),
+          done.reasons.length && !cancelled ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
           done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: seconds })))),
       h('div', { className: 'actions' },
         done.state === 'failed' ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
@@ -167,7 +168,7 @@ export async function scan(main, session) {
     try {
       const { scans } = await get('/scans?limit=4');
       list.replaceChildren(...scans.map((one) => h('a', { className: 'small', href: `#/result/${one.scan_id}` },
-        `${one.label || t('result.noLabel')} – ${t(`state.${one.state}`)}, ${time(one.created)}`)));
+        `${one.label || t('result.noLabel')} – ${t(`state.${outcome(one)}`)}, ${time(one.created)}`)));
     } catch { /* told elsewhere */ }
   }
 
