@@ -22,6 +22,8 @@ _limit_option = click.option(
     show_default=True,
     help="largest number of scans to list, newest first",
 )
+_LABEL_LETTERS = 40
+"""A longer label is cut short in the table."""
 _WORDS = {
     "accepted": "waiting",
     "reconstructing": "reconstructing",
@@ -104,6 +106,8 @@ def _line(scan: ScanRecord) -> str:
     taken = scan.created.replace("T", " ").removesuffix("Z")
     # A label is arbitrary text: control characters must not reach the terminal.
     label = "".join(c if c.isprintable() else "?" for c in scan.label) or "-"
+    if len(label) > _LABEL_LETTERS:
+        label = f"{label[: _LABEL_LETTERS - 1]}…"
     outcome = "cancelled" if scan.cancelled else _WORDS[scan.state]
     reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons and not scan.cancelled else ""
     return f"{scan.scan_id:<24} {taken}  {outcome:<14} {label}{reasons}"

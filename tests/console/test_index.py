@@ -201,6 +201,18 @@ def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:
     assert (found[0]["state"], found[0]["reasons"]) == ("failed", [CANCELLED])
 
 
+def test_a_long_label_is_cut_short_in_the_table_alone(spool: Spool) -> None:
+    """It broke the table."""
+    folder = spool.path("outbox", "20261125T100000Z-0005")
+    folder.mkdir()
+    write_json(folder / "result.json", {"label": 300 * "x", "status": "ok"})
+    option = _booth(spool)
+    (line,) = CliRunner().invoke(station, ["find", "xxx", *option]).output.splitlines()
+    assert line.endswith(f" {39 * 'x'}…")
+    found = json.loads(CliRunner().invoke(station, ["find", "xxx", "--json", *option]).output)
+    assert found[0]["label"] == 300 * "x"
+
+
 def test_a_list_since_what_is_no_day_is_refused(spool: Spool) -> None:
     """It said that there were no scans."""
     option = _booth(spool)
