@@ -13,6 +13,7 @@ from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
+from station.core.files import local_time
 from station.core.spool import Spool
 
 _limit_option = click.option(
@@ -39,7 +40,7 @@ _WORDS = {
     "--since",
     default="",
     callback=lambda _, __, given: _moment(given),
-    help="from this day or time on (2026-11-21, UTC)",
+    help="from this day or time on (2026-11-21, the booth's local time)",
 )
 @_limit_option
 @click.option("--json", "as_json", is_flag=True, help="print JSON")
@@ -47,7 +48,8 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
     """List the scans of this booth, newest first, with their outcome.
 
     Scans that were not taken (nobody in the booth, a silent camera) are not listed: of them there
-    is nothing but the reason that was told. Times are UTC.
+    is nothing but the reason that was told. Times are the booth's local time; those in scan ids and
+    in JSON are UTC.
 
     \b
     Examples:
@@ -81,7 +83,7 @@ def _show(config_path: Path | None, text: str, since: str, limit: int, as_json: 
         click.echo(json.dumps([{**asdict(scan), "verdict": scan.verdict} for scan in found]))
         return
     if not found:
-        since_then = f"no scans since {since}" if since else "no scans yet"
+        since_then = f"no scans since {local_time(since)}" if since else "no scans yet"
         click.echo(f"no scan matches {text!r}" if text else since_then)
     for scan in found:
         click.echo(_line(scan))
@@ -92,22 +94,20 @@ def _moment(given: str) -> str:
     if not given:
         return ""
     try:
-        moment = datetime.fromisoformat(given)
-        if moment.tzinfo is not None:
-            moment = moment.astimezone(UTC)
+        # Without an offset it is the booth's local time.
+        moment = datetime.fromisoformat(given).astimezone(UTC)
     except (ValueError, OverflowError):
         raise click.BadParameter(
-            f"{given} is no day or time: write 2026-11-21, or 2026-11-21T10:00 (UTC)"
+            f"{given} is no day or time: write 2026-11-21, or 2026-11-21T10:00"
         ) from None
     return moment.replace(tzinfo=None).isoformat(timespec="seconds")
 
 
 def _line(scan: ScanRecord) -> str:
-    taken = scan.created.replace("T", " ").removesuffix("Z")
     # A label is arbitrary text: control characters must not reach the terminal.
     label = "".join(c if c.isprintable() else "?" for c in scan.label) or "-"
     if len(label) > _LABEL_LETTERS:
         label = f"{label[: _LABEL_LETTERS - 1]}…"
     outcome = "cancelled" if scan.cancelled else _WORDS[scan.state]
     reasons = f"  {'; '.join(scan.reasons)}" if scan.reasons and not scan.cancelled else ""
-    return f"{scan.scan_id:<24} {taken}  {outcome:<14} {label}{reasons}"
+    return f"{scan.scan_id:<24} {local_time(scan.created)}  {outcome:<14} {label}{reasons}"

@@ -133,6 +133,6 @@ def _vault(config_path: Path | None) -> Vault:
 
 def _day(seconds: float) -> str:
     try:
-        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+        return datetime.fromtimestamp(seconds, UTC).astimezone().strftime("%Y-%m-%d")
     except (ValueError, OverflowError):
         return "a day beyond the calendar"

@@ -30,6 +30,20 @@ def utc_now(precision: Literal["seconds", "milliseconds"] = "seconds") -> str:
     return datetime.now(UTC).isoformat(timespec=precision).replace("+00:00", "Z")
 
 
+def local_time(moment: str) -> str:
+    """A time in UTC, ISO 8601, as the booth's clock on the wall shows it; others stay as they are.
+
+    For what people read; files and programs keep UTC.
+    """
+    try:
+        then = datetime.fromisoformat(moment)
+        if then.tzinfo is None:
+            then = then.replace(tzinfo=UTC)
+        return then.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    except (ValueError, OverflowError):
+        return moment
+
+
 def fsync_folder(folder: Path) -> None:
     """Make the names in a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -6,6 +6,8 @@ import re
 import shutil
 import sqlite3
 import threading
+import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -201,6 +203,32 @@ def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:
     assert (found[0]["state"], found[0]["reasons"]) == ("failed", [CANCELLED])
 
 
+@pytest.fixture
+def in_shanghai(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The machine's clock is set to the time of Shanghai, UTC+8."""
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "Asia/Shanghai")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.mark.usefixtures("in_shanghai")
+def test_people_read_local_time_and_programs_utc(spool: Spool) -> None:
+    """The table showed UTC without saying so."""
+    option = _booth(spool)
+
+    def listed(*words: str) -> str:
+        return CliRunner().invoke(station, ["list", *words, *option]).output
+
+    newest = listed().splitlines()[0]
+    assert newest.startswith("20261123T100000Z-0003    2026-11-23 18:00:00  scan again")
+    assert json.loads(listed("--json"))[0]["created"] == "2026-11-23T10:00:00Z"
+    assert listed("--since", "2026-11-23T17:59").splitlines() == [newest]
+    assert listed("--since", "2026-11-23T18:01") == "no scans since 2026-11-23 18:01:00\n"
+    assert listed("--since", "2026-11-23T09:59Z").splitlines() == [newest]
+
+
 def test_a_long_label_is_cut_short_in_the_table_alone(spool: Spool) -> None:
     """It broke the table."""
     folder = spool.path("outbox", "20261125T100000Z-0005")
@@ -223,7 +251,7 @@ def test_a_list_since_what_is_no_day_is_refused(spool: Spool) -> None:
     assert "gestern is no day or time: write 2026-11-21" in listed("gestern")
     assert "is no day or time" in listed("0001-01-01T00:00+05:00")
     assert listed("0999-01-01") == listed("")
-    assert listed("2099-01-01") == "no scans since 2099-01-01T00:00:00\n"
+    assert listed("2099-01-01") == "no scans since 2099-01-01 00:00:00\n"
     assert listed("20261123").count("\n") == listed("2026-11-23T00:00+00:00").count("\n") > 0
 
 

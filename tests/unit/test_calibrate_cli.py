@@ -24,8 +24,11 @@ from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.console.live import guided
 from station.core.errors import BoothError, CalibrationError
+from station.core.files import local_time
 from station.core.rig import Rig
 from station.simulation.scene import default_rig
+
+STARTED = "2026-11-21T10:00:00Z"
 
 
 @pytest.fixture
@@ -50,7 +53,7 @@ def _run(config: Path, *words: str) -> Result:
 
 
 def _begin(store: CalibrationStore) -> Session:
-    return Session.begin(store.unfinished, "2026-11-21T10:00:00Z", 0.1, CAMERAS)
+    return Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
 
 
 def test_a_damaged_calibration_has_a_line_of_its_own(config: Path, store: CalibrationStore) -> None:
@@ -83,7 +86,7 @@ def test_stored_calibrations_are_listed_and_put_into_use(
     listed = _run(config, "--list").output.splitlines()
     assert listed[0].startswith("* 20261101T100000Z  4 cameras")
     assert listed[1].startswith("  20261102T100000Z")
-    assert "unfinished, started 2026-11-21T10:00:00Z" in listed[2]
+    assert f"unfinished, started {local_time(STARTED)}" in listed[2]
     wrong = _run(config, "--use", "yesterday")
     assert isinstance(wrong.exception, CalibrationError)
     assert "20261101T100000Z, 20261102T100000Z" in str(wrong.exception)
@@ -152,7 +155,7 @@ def test_a_solution_is_of_the_cameras_that_are_configured(
 def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore) -> None:
     _begin(store)
     listed = _run(config, "--list").output
-    assert listed == "  unfinished, started 2026-11-21T10:00:00Z: nothing yet\n"
+    assert listed == f"  unfinished, started {local_time(STARTED)}: nothing yet\n"
 
 
 def test_calibrations_that_were_given_up_are_listed(config: Path, store: CalibrationStore) -> None:
@@ -164,7 +167,7 @@ def test_calibrations_that_were_given_up_are_listed(config: Path, store: Calibra
     session.folder.mkdir()
     store.set_aside()
     lines = _run(config, "--list").output.splitlines()
-    assert lines[0] == "  abandoned-1  given up, started 2026-11-21T10:00:00Z: nothing yet"
+    assert lines[0] == f"  abandoned-1  given up, started {local_time(STARTED)}: nothing yet"
     assert [line.split()[0] for line in lines] == [f"abandoned-{n}" for n in range(1, 11)]
 
 

@@ -14,6 +14,7 @@ from station.calibration.guide.operator import Guide
 from station.core.commands import Number, config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
+from station.core.files import local_time
 
 # The rest is imported after the first words: compiled code takes most of a second to load, and
 # several on a busy station.
@@ -165,7 +166,7 @@ def _list(procedure: Procedure) -> None:
 def _begun(state: str, session: Session) -> str:
     """Words on a calibration that is not solved."""
     origin = f", added to {session.adds_to}" if session.adds_to else ""
-    return f"{state}, started {session.started}{origin}: {session.summary()}"
+    return f"{state}, started {local_time(session.started)}{origin}: {session.summary()}"
 
 
 @calibrate.command("floor")
