@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
+from station.calibration.drift import check_cli
 from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.last_check import keep_check, last_check
 from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
@@ -322,3 +323,24 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     last = last_check(tmp_path)
     assert last is not None
     assert (last["moved"], last["changed"]) == ([], ["a"])
+
+
+def test_cameras_that_share_unseen_directions_are_told_together(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Each had the same long sentence."""
+    blind = np.diag([1e-6] * 3 + [1.0, 1e-8, 1e-8])
+    sharp = 1e-8 * np.eye(6)
+    moves = [
+        CameraMove(name, np.zeros(6), covariance, 1.0)
+        for name, covariance in (("a", blind), ("b", sharp), ("c", blind))
+    ]
+    words = ", ".join(moves[0].unseen_words())
+    assert "shift sideways" in words
+    check_cli._tell(moves, [], moved=False)
+    assert capsys.readouterr().out.splitlines() == [
+        *(f"camera {name} stands where it was calibrated" for name in "abc"),
+        f"  cameras a, c: a small {words} cannot be detected",
+        "  a fixed post or corner in a camera's view would make it possible",
+        "the booth is in order: no camera has moved, as far as their views can show",
+    ]

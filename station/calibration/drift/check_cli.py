@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -122,11 +123,8 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
 def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) -> None:
     for move in moves:
         click.echo(move.words())
-        if not move.lost and move.unseen():
-            click.echo(
-                f"  this view cannot detect a small {', '.join(move.unseen_words())}; "
-                "a fixed post or corner in its view would make it possible"
-            )
+    for line in _unseen_lines(moves):
+        click.echo(f"  {line}")
     if words := depths_words(moves):
         click.echo(words)
     if changed:
@@ -139,6 +137,22 @@ def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) ->
         )
     elif not moved:
         click.echo("the booth is in order: no camera has moved, as far as their views can show")
+
+
+def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
+    """Lines on the directions that views cannot show, one for all cameras that share them."""
+    cameras: dict[str, list[str]] = {}
+    for move in moves:
+        if not move.lost and (words := ", ".join(move.unseen_words())):
+            cameras.setdefault(words, []).append(move.camera)
+    lines = [
+        f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}: a small {words} cannot be "
+        "detected"
+        for words, names in cameras.items()
+    ]
+    if lines:
+        lines.append("a fixed post or corner in a camera's view would make it possible")
+    return lines
 
 
 def _look(feed: Feed, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:
