@@ -18,6 +18,7 @@ from station.calibration.detect.step_names import EMPTY
 from station.core.errors import DriverError
 from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
+from station.core.service import answered
 from station.sensors.freenect import find_library
 from station.simulation.record_cli import PROCEDURE, TRUTH
 
@@ -101,10 +102,14 @@ def _wait_for_control(environment: dict[str, str]) -> None:
     """Wait until the station responds."""
     deadline_s = time.monotonic() + _STARTS_S
     while time.monotonic() < deadline_s:
-        answer = subprocess.run(
-            [*STATION, "status"], env=environment, capture_output=True, check=False
+        done = subprocess.run(
+            [*STATION, "status", "--json"],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
-        if answer.returncode == 0:
+        if answered(done.stdout):
             return
         time.sleep(0.2)
     raise SystemExit("error: the station did not start; read its log")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from station.core.service import die_with_parent
+from station.core.service import answered, die_with_parent
 
 STATION = (sys.executable, "-m", "station.cli")
 
@@ -34,7 +34,9 @@ class Station:
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )
         try:
-            self.wait_until(lambda: self.command("status").returncode == 0, "control answers")
+            self.wait_until(
+                lambda: answered(self.command("status", "--json").stdout), "control answers"
+            )
         except BaseException:
             self.close()
             raise

@@ -37,6 +37,7 @@ from station.core.config_file import find_config, load_config
 from station.core.drivers import CameraConfig
 from station.core.errors import BoothError, ConfigError, DriverError
 from station.core.files import write_bytes
+from station.core.service import answered
 from station.sensors.freenect import FreenectCamera
 
 _ANSWER_S = 30.0
@@ -222,8 +223,9 @@ def _wait_for_control() -> None:
     """Wait until control answers; the command runs as the booth's user, who owns the sockets."""
     deadline_s = time.monotonic() + _ANSWER_S
     while True:
-        done = subprocess.run([_COMMAND, "status"], capture_output=True, text=True, check=False)
-        if done.returncode == 0:
+        told = [_COMMAND, "status", "--json"]
+        done = subprocess.run(told, capture_output=True, text=True, check=False)
+        if answered(done.stdout):
             return
         if time.monotonic() > deadline_s:
             cause = done.stderr.strip().removeprefix("error: ")

@@ -89,6 +89,16 @@ def starting(processes: Mapping[str, Mapping[str, Any]]) -> set[str]:
     return {name for name, told in processes.items() if not told or told["told_s"] < began_s}
 
 
+def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
+    """Whether nothing is in the way of a scan, from control's answer: no silence, a calibration.
+
+    Sensors that were stopped are expected to be silent.
+    """
+    silent = status["sync"].get("silent", ["unknown"]) if status["streaming"] else []
+    processes = status["processes"].values()
+    return all(map(reports, processes)) and not silent and config.calibration.exists()
+
+
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:
     """Messages about processes that do not report, with remedies."""
     if not any(map(reports, processes.values())):

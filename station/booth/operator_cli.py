@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import booth_health, reports, starting
+from station.booth.health import booth_health, can_scan, reports, starting
 from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -27,6 +27,7 @@ from station.messaging.transport import NoAnswerError, ask
 
 _POLL_S = 0.05
 _EXIT_RESCAN = 3
+_EXIT_NO_SCANS = 1
 _UNSURE_S = 15.0
 """Time within which a process that hangs is restarted and the outcome of a scan is known again."""
 _TIMEOUT = Number(0.0, 86400.0, unit="seconds")
@@ -119,7 +120,9 @@ def cancel(scan_id: str, config_path: Path | None) -> None:
 def status(config_path: Path | None, as_json: bool) -> None:
     """Show processes, cameras, framesets and the spool, and what is wrong with them.
 
-    Exit code 1: the station does not respond; what is known about it is shown anyway.
+    Exit code 0: scans can be taken, once the sensors are started if they are stopped; 1: they
+    cannot, because the booth does not run, a process or a camera is silent, or it is not
+    calibrated. What is known is shown either way.
 
     \b
     Examples:
@@ -140,6 +143,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
         _show_status(content)
     if error is not None:
         raise error
+    if not can_scan(config, content):
+        sys.exit(_EXIT_NO_SCANS)
 
 
 def _show_status(content: Mapping[str, Any]) -> None:

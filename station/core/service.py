@@ -268,6 +268,14 @@ def read_health(runtime_folder: Path, process: str) -> dict[str, Any]:
     return {**content, "started_s": started_s, "age_s": age_s} if age_s >= 0.0 else {}
 
 
+def answered(status: str) -> bool:
+    """Whether control answered, from what `station status --json` printed."""
+    try:
+        return json.loads(status)["streaming"] is not None
+    except (ValueError, KeyError, TypeError):
+        return False
+
+
 def die_with_parent(parent: int) -> None:
     """Ask the kernel to end this process when its parent (a process id) ends (Linux).
 

@@ -19,6 +19,7 @@ import pytest
 
 from install.bars import TABLE
 from install.machine import Machine
+from station.core.service import answered
 
 STATE = "/var/lib/booth"
 _DELIVERED = (0, 3)
@@ -76,9 +77,13 @@ def _accepted(machine: Machine) -> set[str]:
     return {path.name for state in states for path in (spool / state).iterdir()}
 
 
+def _status(machine: Machine) -> str:
+    return machine.run("station", "status", "--json", check=False).stdout
+
+
 def _ready(machine: Machine) -> None:
     """The sensors run and every camera gives frames."""
-    _until(lambda: machine.run("station", "status", check=False).returncode == 0, "control answers")
+    _until(lambda: answered(_status(machine)), "control answers")
     machine.run("station", "start", "--timeout", "60")
 
 
@@ -282,7 +287,7 @@ def test_a_driver_of_another_sensor_streams(machine: Machine, tmp_path: Path) ->
         machine.run("systemctl", "daemon-reload")
         machine.run("systemctl", "restart", "booth.target")
         _ready(machine)
-        told = json.loads(machine.run("station", "status", "--json").stdout)
+        told = json.loads(_status(machine))
         assert told["sync"]["cameras"]["fifth"]["state"] == "streaming"
         assert "booth-capture@fifth.service" in _services(machine)
     finally:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from station.booth.health import MAX_AGE_S, booth_health, starting
+from station.booth import operator_cli
+from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting
 from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
-from station.core.service import HEALTH, STATION_LOCK, file_name
+from station.core.service import HEALTH, STATION_LOCK, answered, file_name
+from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
 
 _CAMERAS = ("a", "b")
@@ -161,3 +165,36 @@ def test_framesets_that_are_too_rare_for_a_scan_are_told(
     finally:
         sync._writer.close()
         sync._context.destroy(linger=0)
+
+
+def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was 0 with a silent camera."""
+
+    def code(*, streaming: bool, silent: Sequence[str] = ()) -> int:
+        _problems(config, streaming=streaming, silent=silent, cameras={})
+        told = {**asdict(booth_health(config)), "streaming": streaming}
+        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
+        path = str(config.runtime.folder.parent / "booth.toml")
+        done = CliRunner().invoke(operator_cli.status, ["--json", "--config", path])
+        assert answered(done.stdout)
+        return done.exit_code
+
+    assert code(streaming=True) == 0
+    assert code(streaming=True, silent=["a"]) == 1
+    assert code(streaming=False, silent=["a"]) == 0
+    config.calibration.unlink()
+    assert code(streaming=True) == 1
+
+
+def test_a_silent_process_is_in_the_way_of_scans(config: BoothConfig) -> None:
+    _problems(config, streaming=True, silent=[], cameras={})
+    assert can_scan(config, {**asdict(booth_health(config)), "streaming": True})
+    _tell(config, "capture a", age_s=5.0)
+    assert not can_scan(config, {**asdict(booth_health(config)), "streaming": True})
+
+
+def test_control_answered_if_it_says_whether_the_sensors_run() -> None:
+    told = {'{"streaming": false}': True, '{"streaming": null}': False, "[]": False, "": False}
+    assert {text: answered(text) for text in told} == told
