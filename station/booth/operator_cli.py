@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ _WORDS = {
     "accepted": "scan accepted: the person may leave",
     "reconstructing": "reconstructing",
 }
+_CHANGING = (_WORDS["capturing"], _WORDS["reconstructing"])
 
 
 def _command(config: BoothConfig, request: Request) -> dict[str, Any]:
@@ -260,42 +262,63 @@ def _follow(
 ) -> dict[str, Any]:
     """Show each new state on a line of its own until it is enough."""
     scan_id = order.scan_id
-    told, free, sure_s = "", False, time.monotonic()
-    while True:
-        state = session["state"]
-        if session["reason"] != UNSURE:
-            sure_s = time.monotonic()
-        elif time.monotonic() - sure_s > _UNSURE_S:
-            raise UnsureError(scan_id)
-        if state in ON_DISK and state != "accepted" and not free:
-            # The scan ended before this poll; the person waits for this message.
-            click.echo(f"  {_WORDS['accepted']:<44}")
-        free = free or state in ON_DISK
-        words = _WORDS.get(state, state)
-        if state == "capturing" and session["wanted"]:
-            words += f" ({session['framesets']} of {session['wanted']})"
-            if session["framesets"] >= session["wanted"]:
-                words = "pictures taken: the person may move; storing"
-        if session["reason"] == UNSURE:
-            words = UNSURE
-        if words != told:
-            fresh = sys.stdout.isatty() and told.startswith("hold still")
-            click.echo(("\r" if fresh else "") + f"  {words:<44}", nl=not words.startswith("hold"))
-            if words.startswith("hold") and not sys.stdout.isatty():
-                click.echo()
-            told = words
-        if enough(state):
-            return session
-        if time.monotonic() > deadline_s:
-            raise BoothError(
-                f"scan {scan_id} is not done yet (its state is {state}) and goes on; do not scan "
-                f"again: station find {scan_id} shows its outcome"
-            )
-        time.sleep(_POLL_S)
-        # The order itself may not have been recorded; repeated, it is the same scan.
-        unsure = session["reason"] == UNSURE
-        request = order if unsure else Request("scan-status", scan_id)
-        session = _ask_until_answered(config, request)
+    free, sure_s = False, time.monotonic()
+    begun_s: float | None = None
+    with closing(_Line()) as line:
+        while True:
+            state = session["state"]
+            if session["reason"] != UNSURE:
+                sure_s = time.monotonic()
+            elif time.monotonic() - sure_s > _UNSURE_S:
+                raise UnsureError(scan_id)
+            if state in ON_DISK and state != "accepted" and not free:
+                # The scan ended before this poll; the person waits for this message.
+                line.show(_WORDS["accepted"])
+            free = free or state in ON_DISK
+            words = _WORDS.get(state, state)
+            if state == "capturing" and session["wanted"]:
+                words += f" ({session['framesets']} of {session['wanted']})"
+                if session["framesets"] >= session["wanted"]:
+                    words = "pictures taken: the person may move; storing"
+            if state == "reconstructing" and sys.stdout.isatty():
+                begun_s = begun_s or time.monotonic()
+                words += f" ({time.monotonic() - begun_s:.0f} s)"
+            if session["reason"] == UNSURE:
+                words = UNSURE
+            line.show(words, changes=words.startswith(_CHANGING))
+            if enough(state):
+                return session
+            if time.monotonic() > deadline_s:
+                raise BoothError(
+                    f"scan {scan_id} is not done yet (its state is {state}) and goes on; do not "
+                    f"scan again: station find {scan_id} shows its outcome"
+                )
+            time.sleep(_POLL_S)
+            # The order itself may not have been recorded; repeated, it is the same scan.
+            unsure = session["reason"] == UNSURE
+            request = order if unsure else Request("scan-status", scan_id)
+            session = _ask_until_answered(config, request)
+
+
+class _Line:
+    """The line of a scan's state; where somebody watches, it is written over while it changes."""
+
+    def __init__(self) -> None:
+        self._told, self._open = "", False
+
+    def show(self, words: str, *, changes: bool = False) -> None:
+        """Show words that are new; ``changes``: others of the same state may follow."""
+        if words == self._told:
+            return
+        written_over = changes and sys.stdout.isatty()
+        click.echo(("\r" if self._open else "") + f"  {words:<44}", nl=not written_over)
+        self._told, self._open = words, written_over
+
+    def close(self) -> None:
+        """End the line: whatever is told next has its own."""
+        if self._open:
+            click.echo()
+            self._open = False
 
 
 class UnsureError(BoothError):

@@ -1,19 +1,24 @@
 """Output of the operator's commands."""
 
+import itertools
 import json
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
 import pytest
 from click.testing import CliRunner, Result
 
-from station.booth.operator_cli import cancel, scan, show_result, start, status, stop
+from station.booth import operator_cli
+from station.booth.operator_cli import _follow, cancel, scan, show_result, start, status, stop
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import held
 from station.core.service import HEALTH, STATION_LOCK
+from station.messaging.messages import Request
 
 
 def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
@@ -96,3 +101,34 @@ def test_a_booth_that_is_starting_is_waited_for(one_camera: BoothConfig) -> None
     with held(one_camera.runtime.folder / STATION_LOCK, BoothError("held")):
         done = _run(stop, one_camera)
     assert "did not answer within 0.2 s" in str(done.exception)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_reconstruction_counts_its_seconds_on_one_line(
+    one_camera: BoothConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    watched: bool,
+) -> None:
+    """It said nothing for most of a minute on a busy computer."""
+    states = iter(["accepted", *7 * ["reconstructing"]])
+    moments_s = itertools.count(0.0, 0.25)
+    clock = SimpleNamespace(monotonic=lambda: next(moments_s), sleep=lambda _: None)
+
+    def answer(*_: object) -> dict[str, Any]:
+        return {"state": next(states), "reason": "", "wanted": 0, "framesets": 0}
+
+    monkeypatch.setattr(operator_cli, "_ask_until_answered", answer)
+    monkeypatch.setattr(operator_cli, "time", clock)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: watched)
+    order = Request("scan", "a")
+    with pytest.raises(BoothError, match="is not done yet"):
+        _follow(one_camera, order, answer(), lambda _: False, 3.0)
+    *_, last = capsys.readouterr().out.split("\n")[:-1]
+    told = [words.strip() for words in last.split("\r")]
+    if not watched:
+        assert told == ["reconstructing"]
+    else:
+        assert told[0] == "reconstructing (0 s)"
+        assert "reconstructing (1 s)" in told
