@@ -68,7 +68,11 @@ class Collection:
             return "; ".join(troubles)
         if silent:
             remedy = check_words(silent, recorded)
-            return f"camera {', '.join(silent)} went silent; {remedy}; scan again"
+            return (
+                f"camera {silent[0]} went silent; {remedy}; scan again"
+                if len(silent) == 1
+                else f"cameras {', '.join(silent)} went silent; {remedy}; scan again"
+            )
         return too_slow_words(len(self.sets), self.wanted, within_s, tolerance_s)
 
 

@@ -148,8 +148,11 @@ class ScanWriter:
             rig.camera(name, str(self._config.calibration))
         if others := [name for name in rig.cameras if name not in self._names]:
             raise CalibrationError(
-                f"camera {', '.join(others)} was calibrated and is not in booth.toml: put it "
-                "back, or calibrate the booth again"
+                f"camera {others[0]} was calibrated and is not in booth.toml: put it back, or "
+                "calibrate the booth again"
+                if len(others) == 1
+                else f"cameras {', '.join(others)} were calibrated and are not in booth.toml: put "
+                "them back, or calibrate the booth again"
             )
         note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
         spool.notes.write(note, durable=False)

@@ -311,7 +311,7 @@ def test_a_board_is_looked_for_in_a_folder_of_images(config: Path, store: Calibr
     _begin(store)
     done = _run(config, "board", "--images", str(images))
     assert done.exit_code == 0, done.output
-    assert "camera front-lower: the board is seen in 1 images" in done.output
+    assert "camera front-lower: the board is seen in 1 image\n" in done.output
     assert "the factory's lens is kept, 12 are needed" in done.output
     assert Session.load(store.unfinished).lenses == {}
 

@@ -180,7 +180,7 @@ def test_what_was_seen_is_listed(tmp_path: Path) -> None:
     session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
     for step in ("hanging-1800", "hanging-700", "stand-1080"):
         session.record_resting(step, [ball("front-lower", 1.0)])
-    listed = "the ball hanging at 1.8 and 0.7 m, the ball on a stand at 1.08 m"
+    listed = "the ball hanging at 1.8 and 0.7 m; the ball on a stand at 1.08 m"
     assert session.summary() == listed
 
 

@@ -36,3 +36,12 @@ def test_recordings_have_no_cables() -> None:
     collection = Collection(_ORDER, default_rig(), 10, 0.0)
     assert "check its cable" in collection.too_few(["a"], set(), [], 3.0, 0.025)
     assert "check the recording" in collection.too_few(["a"], {"a"}, [], 3.0, 0.025)
+
+
+def test_several_cameras_are_named_in_the_plural() -> None:
+    """It said "camera a, b"."""
+    collection = Collection(_ORDER, default_rig(), 10, 0.0)
+    both = collection.too_few(["a", "b"], set(), [], 3.0, 0.025)
+    assert both == "cameras a, b went silent; check their cables; scan again"
+    one = collection.too_few(["a"], set(), [], 3.0, 0.025)
+    assert one == "camera a went silent; check its cable; scan again"

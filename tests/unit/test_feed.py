@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -125,6 +127,13 @@ def test_a_recording_that_is_too_short_is_told_how_long_it_has_to_be(
         feed.cameras(20.0)
         with pytest.raises(CalibrationError, match="its recording has to last 3 s or longer"):
             gather_frames(feed, [name], 60, lambda _: None)
+
+
+def test_several_cameras_with_too_few_frames_have_recordings_of_their_own() -> None:
+    """It said "camera a, b gave too few frames; its recording"."""
+    frames = SimpleNamespace(over=True, replays=True)
+    with pytest.raises(CalibrationError, match="cameras a, b gave too few frames; their recording"):
+        gather_frames(cast(Feed, frames), ["a", "b"], 60, lambda _: None)
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:

@@ -78,6 +78,9 @@ def test_a_step_without_a_cameras_recording_is_found_before_the_first_step(
     replayed = replace(begun, config=cast(BoothConfig, config), recordings=tmp_path / "recordings")
     with pytest.raises(CalibrationError, match=f"ball holds no recording of camera {names[2]}"):
         replayed.run()
+    (tmp_path / "recordings" / "ball" / names[3]).rmdir()
+    with pytest.raises(CalibrationError, match=f"of cameras {names[2]}, {names[3]}: record"):
+        replayed.run()
     assert looked == []
 
 

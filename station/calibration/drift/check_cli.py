@@ -103,10 +103,10 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
     if missing:
         raise CalibrationError(
             f"the calibration in use ({config.calibration}) has no picture of the empty booth by "
-            f"camera {', '.join(missing)}; calibrate with station calibrate"
+            f"{_cameras(missing)}; calibrate with station calibrate"
         )
     if others := [name for name in scene if name not in names]:
-        click.echo(f"not in booth.toml, and not looked at: camera {', '.join(others)}", err=True)
+        click.echo(f"not in booth.toml, and not looked at: {_cameras(others)}", err=True)
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
         taken = _look(feed, names, quiet)
@@ -146,13 +146,15 @@ def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
         if not move.lost and (words := ", ".join(move.unseen_words())):
             cameras.setdefault(words, []).append(move.camera)
     lines = [
-        f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}: a small {words} cannot be "
-        "detected"
-        for words, names in cameras.items()
+        f"{_cameras(names)}: a small {words} cannot be detected" for words, names in cameras.items()
     ]
     if lines:
         lines.append("a fixed post or corner in a camera's view would make it possible")
     return lines
+
+
+def _cameras(names: Sequence[str]) -> str:
+    return f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
 
 
 def _look(feed: Feed, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:

@@ -237,16 +237,26 @@ def gather_frames(
         progress(f"{min(len(seen) for seen in taken.values())} of {frames} frames received")
     few = [name for name, seen in taken.items() if len(seen) < frames // 2]
     if few:
-        raise CalibrationError(
-            f"camera {', '.join(few)} gave too few frames; "
-            + (
-                "its recording has to last 3 s or longer; stop other programs if the computer is "
-                "busy"
-                if feed.replays
-                else "see station status and do it again"
-            )
-        )
+        raise CalibrationError(_too_few_words(few, replays=feed.replays))
     return taken
+
+
+def _too_few_words(few: Sequence[str], *, replays: bool) -> str:
+    """Words on cameras that gave too few frames."""
+    one = len(few) == 1
+    words = (
+        f"camera {few[0]} gave too few frames"
+        if one
+        else f"cameras {', '.join(few)} gave too few frames"
+    )
+    if not replays:
+        return f"{words}; see station status and do it again"
+    lasting = (
+        "its recording has to last 3 s or longer"
+        if one
+        else "their recordings have to last 3 s or longer"
+    )
+    return f"{words}; {lasting}; stop other programs if the computer is busy"
 
 
 @contextmanager

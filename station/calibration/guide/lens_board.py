@@ -33,7 +33,9 @@ def judge_lenses(attempt: Attempt, images: Path, printed: Board) -> None:
     views: dict[str, list[BoardView]] = {}
     for name in session.cameras:
         views[name] = _board_views(images / name, printed, session, name)
-        attempt.guide.say(f"camera {name}: the board is seen in {len(views[name])} images")
+        count = len(views[name])
+        images_words = "1 image" if count == 1 else f"{count} images"
+        attempt.guide.say(f"camera {name}: the board is seen in {images_words}")
     if not any(views.values()):
         raise CalibrationError(
             f"{images} has no image of the board: DIR/<camera>/<moment>.png, cameras "

@@ -58,9 +58,8 @@ class Procedure(Attempt):
                 f"continuing the calibration that was started at {session.started}; if a camera "
                 "was moved since, begin anew: station calibrate --new"
             )
-            self.guide.say(
-                f"  already recorded: {session.summary()}; to repeat a step, run its own command"
-            )
+            self.guide.say(f"already recorded: {session.summary()}")
+            self.guide.say("to repeat a step, run its own command")
         if session is None or not session.done(EMPTY):
             self.empty()
         if session is None or not self._waved(session):
@@ -108,8 +107,11 @@ class Procedure(Attempt):
             ]
             if missing:
                 raise CalibrationError(
-                    f"{step} holds no recording of camera {', '.join(missing)}: record that step "
-                    "again, or take its folder away"
+                    f"{step} holds no recording of camera {missing[0]}: record that step again, or "
+                    "take its folder away"
+                    if len(missing) == 1
+                    else f"{step} holds no recording of cameras {', '.join(missing)}: record that "
+                    "step again, or take its folder away"
                 )
 
     def empty(self) -> None:

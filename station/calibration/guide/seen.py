@@ -133,12 +133,13 @@ class Seen:
 
     def summary(self) -> str:
         """Summary of the observations so far, for the operator."""
+        places = self.around_count
         parts = {
             "the empty booth": self.done(EMPTY),
             f"{len(self.balls)} sightings of the waved ball": bool(self.balls),
             "the ball on the mark": self.done(MARK),
             "the ball in front of it": self.done(FRONT),
-            f"{self.around_count} places around it": bool(self.around_count),
+            "1 place around it" if places == 1 else f"{places} places around it": bool(places),
             f"the ball hanging at {listed(self.raised_as(HANGING).values())} m": bool(
                 self.raised_as(HANGING)
             ),
@@ -147,7 +148,7 @@ class Seen:
             ),
             f"the board at {self.wall_count} of its places": self.done(WALL),
         }
-        return ", ".join(words for words, seen in parts.items() if seen) or "nothing yet"
+        return "; ".join(words for words, seen in parts.items() if seen) or "nothing yet"
 
     @property
     def around_count(self) -> int:
