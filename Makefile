@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 # Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
-# share, and files begin in their order, the long ones of tests/accuracy first.
+# share (tests/conftest.py), and files begin in their order, the long ones of tests/accuracy first.
 PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 # More BLAS or OpenMP threads than cores wait for each other, at full processor time: a Cholesky
 # factor of 1,100 unknowns takes ten times as long.

@@ -8,11 +8,15 @@ from pathlib import Path
 
 import pytest
 from running_station import STATION, Station
+from xdist.scheduler import LoadFileScheduling
 
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
+
+_OF_BODIES = [f"tests/accuracy/test_{name}.py" for name in ("bars", "model_accuracy", "unlike")]
+"""Files that share the database of bodies: half a minute to make."""
 
 _ONE_CAMERA = """
 [[cameras]]
@@ -22,6 +26,18 @@ recording = "front-lower"
 [spool]
 folder = "spool"
 """
+
+
+class _Files(LoadFileScheduling):  # type: ignore[misc]  # xdist states no types
+    """A process takes whole files, and those of bodies together."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        path = super()._split_scope(nodeid)
+        return _OF_BODIES[0] if path in _OF_BODIES else path
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling:
+    return _Files(config, log)
 
 
 @pytest.fixture

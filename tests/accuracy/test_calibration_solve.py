@@ -77,9 +77,10 @@ def test_a_bodys_cloud_is_right_to_tenths_of_a_millimetre(
     assert abs(found.height_mm) < 3e3 * predicted.height_sigma_m
 
 
-def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None:
+def test_detections_tell_how_noisy_they_are(
+    procedure: VirtualProcedure, seen: Observations, solution: Solution
+) -> None:
     """A sensor that is twice as noisy as it claims is not believed, and priors are no noisier."""
-    seen = synthetic.observations(procedure, rate_hz=RATE_HZ)
 
     def boasting(ball: BallDetection) -> BallDetection:
         return replace(ball, patches=ball.patches * (1.0, 1.0, 1.0, 0.25))
@@ -91,9 +92,8 @@ def test_detections_tell_how_noisy_they_are(procedure: VirtualProcedure) -> None
     boasted = replace(
         seen, balls=boast(seen.balls), mark=boast(seen.mark), front=boast(seen.front), around=around
     )
-    rig = procedure.booth.rig
-    honest, doubted = (solved(rig, observed).world_poses for observed in (seen, boasted))
-    sigmas = [np.sqrt(np.diag(world_poses.covariance)) for world_poses in (honest, doubted)]
+    doubted = solved(procedure.booth.rig, boasted)
+    sigmas = [np.sqrt(np.diag(found.world_poses.covariance)) for found in (solution, doubted)]
     shares = sigmas[1] / sigmas[0]
     assert shares.max() < 1.1
     assert np.median(shares) > 0.75
@@ -137,15 +137,6 @@ def test_a_sound_booth_has_sound_clocks() -> None:
     procedure = VirtualProcedure(synthetic.booth(10))
     seen = synthetic.observations(procedure)
     assert solved(procedure.booth.rig, seen).held_out
-
-
-def test_the_heading_comes_from_the_front_cameras_without_a_second_place(
-    procedure: VirtualProcedure, seen: Observations
-) -> None:
-    rig = solved(procedure.booth.rig, replace(seen, front=())).rig
-    middle = np.mean([rig.cameras[name].world_from_camera[:3, 3] for name in FRONT], axis=0)
-    assert abs(middle[0]) < 1e-6
-    assert middle[1] < -1.0
 
 
 def test_clock_offsets_are_found(procedure: VirtualProcedure, solution: Solution) -> None:
@@ -210,7 +201,10 @@ def test_cameras_that_all_hang_low_are_refused() -> None:
 
 
 def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observations) -> None:
-    """The head of whoever waves the ball is found in its stead now and then."""
+    """The head of whoever waves the ball is found in its stead now and then.
+
+    There is no second place here: the heading comes from the front cameras.
+    """
     rng = np.random.default_rng(3)
     heads = [
         replace(ball, center_m=ball.center_m + rng.normal(0, 0.3, 3), radius_m=0.1)
@@ -218,9 +212,13 @@ def test_other_round_things_do_no_harm(procedure: VirtualProcedure, seen: Observ
         else ball
         for ball in seen.balls
     ]
-    solution = solved(procedure.booth.rig, replace(seen, balls=heads))
+    solution = solved(procedure.booth.rig, replace(seen, balls=heads, front=()))
     twists = reference_errors(procedure.booth.rig, solution.world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 3e-3
+    places = [solution.rig.cameras[name].world_from_camera[:3, 3] for name in FRONT]
+    middle = np.mean(places, axis=0)
+    assert abs(middle[0]) < 1e-6
+    assert middle[1] < -1.0
 
 
 def test_two_cameras_that_agree_on_a_head_do_no_harm(
@@ -382,7 +380,7 @@ def test_a_floor_that_slopes_is_not_taken_for_a_hook_that_moved() -> None:
 def test_a_hook_that_moved_is_refused(procedure: VirtualProcedure) -> None:
     booth = procedure.booth
     hung = _MovedHook(booth, hanging=True)
-    long_s = np.linspace(0.0, 600.0, 20_000).tolist()
+    long_s = np.linspace(0.0, 600.0, 2_000).tolist()
     upper_m, lower_m = (
         np.mean([hung.resting_m(step, time_s)[:2] for time_s in long_s], axis=0)
         for step in ("hanging-1800", "hanging-700")

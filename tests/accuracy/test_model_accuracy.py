@@ -15,7 +15,7 @@ from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.cache import FOLDER_VARIABLE
 from workers.scape.model.sampled import SampledBody
 
-BODIES = 5
+BODIES = 3
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_the_shipped_template_is_the_database_s(model: BodyModel, database: Body
 
 def test_splits_share_no_body(database: BodyDatabase) -> None:
     splits: tuple[Split, ...] = ("train", "validation", "test")
-    ages = [set(database.sample(split, 16, 0).phenotypes["age"].tolist()) for split in splits]
+    ages = [set(database.sample(split, 4, 0).phenotypes["age"].tolist()) for split in splits]
     assert not ages[0] & ages[1]
     assert not ages[0] & ages[2]
     assert not ages[1] & ages[2]
@@ -82,7 +82,7 @@ def test_bodies_have_the_sizes_of_the_persons_they_were_made_for(database: BodyD
 
 def test_a_seed_learns_the_same_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "cache"))
-    plan = TrainingPlan(bodies=16, poses=20, components=8, residual_bodies=2)
+    plan = TrainingPlan(bodies=10, poses=10, components=8, residual_bodies=2)
     said = []
     for name in ("one.npz", "two.npz"):
         train(tmp_path / name, plan, lambda step, share: said.append((share, step)))
