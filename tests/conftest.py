@@ -36,6 +36,7 @@ class _Files(LoadFileScheduling):  # type: ignore[misc]  # xdist states no types
         return _OF_BODIES[0] if path in _OF_BODIES else path
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling:
     return _Files(config, log)
 

@@ -26,7 +26,7 @@ from workers.cloud.preprocess import preprocess
 from workers.scape.fit.fit import fit_body
 from workers.scape.model.body_model import BodyModel, load_model
 
-BODIES = 3
+BODIES = 2
 HARD = ("no front-upper", "camera 5 mm off", "arms close")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workers.scape.learn.database import BodyDatabase, Split, body_database
+from workers.scape.learn.database import BodyDatabase, Shapes, Split, body_database
 from workers.scape.learn.people.survey import STATURE, WAIST, Regression, surveyed
 from workers.scape.learn.people.tailoring import sizes_of
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
@@ -28,6 +28,11 @@ def database() -> BodyDatabase:
     return body_database()
 
 
+@pytest.fixture(scope="module")
+def held_out(database: BodyDatabase) -> Shapes:
+    return database.sample("test", 16, 0)
+
+
 def _rms_m(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     """Vertex rms of each body after the best fit of pose and shape."""
     samples = SampledBody.build(model, np.arange(0, model.vertex_count, PROJECTION_STRIDE))
@@ -35,8 +40,10 @@ def _rms_m(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.sum((np.array(fitted) - bodies) ** 2, axis=2), axis=1))
 
 
-def test_held_out_bodies_are_found(model: BodyModel, database: BodyDatabase) -> None:
-    shapes = database.sample("test", BODIES, 21)
+def test_held_out_bodies_are_found(
+    model: BodyModel, database: BodyDatabase, held_out: Shapes
+) -> None:
+    shapes = held_out.take(np.arange(BODIES))
     neutral = _rms_m(model, database.vertices(shapes))
     assert neutral.mean() < 0.0015
     assert neutral.max() < 0.003
@@ -54,23 +61,25 @@ def test_the_shipped_template_is_the_database_s(model: BodyModel, database: Body
     assert np.array_equal(model.symmetry, database.symmetry)
 
 
-def test_splits_share_no_body(database: BodyDatabase) -> None:
-    splits: tuple[Split, ...] = ("train", "validation", "test")
-    ages = [set(database.sample(split, 4, 0).phenotypes["age"].tolist()) for split in splits]
+def test_splits_share_no_body(database: BodyDatabase, held_out: Shapes) -> None:
+    others: tuple[Split, ...] = ("train", "validation")
+    drawn = [held_out, *(database.sample(split, 16, 0) for split in others)]
+    ages = [set(shapes.phenotypes["age"].tolist()) for shapes in drawn]
     assert not ages[0] & ages[1]
     assert not ages[0] & ages[2]
     assert not ages[1] & ages[2]
 
 
-def test_bodies_have_the_sizes_of_the_persons_they_were_made_for(database: BodyDatabase) -> None:
+def test_bodies_have_the_sizes_of_the_persons_they_were_made_for(
+    database: BodyDatabase, held_out: Shapes
+) -> None:
     """The bodies' spread was 1.5 to 2.5 times people's, and hands were 26 mm long of the mean."""
-    shapes = database.sample("test", 16, 0)
-    sizes = sizes_of(database, shapes)
+    sizes = sizes_of(database, held_out)
     assert np.isfinite(sizes).all()
     people = surveyed()
     for sex in (False, True):
         expected = Regression.of(people.take(people.female == sex))
-        mine = (shapes.phenotypes["gender"] > 0.5) == sex
+        mine = (held_out.phenotypes["gender"] > 0.5) == sex
         stature, waist = sizes[mine][:, [STATURE, WAIST]].T
         off = sizes[mine] - expected.sizes(stature, waist, np.full(mine.sum(), 45.0))
         deviation = np.delete(expected.deviations, [STATURE, WAIST], axis=1).std(axis=0)
