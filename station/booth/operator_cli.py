@@ -15,18 +15,20 @@ import click
 
 from station.archive.tables import printed_table, read_measurements
 from station.booth.health import booth_health, can_scan, reports, starting
-from station.booth.session import FINAL, MAX_LABEL_LENGTH, ON_DISK, UNSURE
+from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
-from station.core.service import NOTHING_RUNS, STATION_LOCK
+from station.core.service import NOTHING_RUNS, STATION_LOCK, anything_runs
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError, ask
 
 _POLL_S = 0.05
+_BEGINS_S = 3.0
+"""Time within which `station run` shows that it runs, on a busy computer."""
 _EXIT_RESCAN = 3
 _EXIT_NO_SCANS = 1
 _UNSURE_S = 15.0
@@ -62,6 +64,7 @@ def start(config_path: Path | None, timeout_s: float) -> None:
       station start
     """
     config = load_config(find_config(config_path))
+    _await_station(config.runtime.folder)
     _command(config, Request("start"))
     began_s = time.monotonic()
     deadline_s = began_s + timeout_s
@@ -85,6 +88,13 @@ def start(config_path: Path | None, timeout_s: float) -> None:
         time.sleep(_POLL_S)
     count = len(config.cameras)
     click.echo(f"{count} camera{'s' if count > 1 else ''} streaming")
+
+
+def _await_station(runtime_folder: Path) -> None:
+    """Give `station run`, begun a moment ago in the same script, the time to show that it runs."""
+    deadline_s = time.monotonic() + _BEGINS_S
+    while not anything_runs(runtime_folder) and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
 
 
 @click.command()
@@ -355,7 +365,7 @@ def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]
 def _text(label: str) -> str:
     """A label, with unprintable characters removed."""
     text = label.encode(errors="surrogateescape").decode(errors="replace")
-    return "".join(letter if letter.isprintable() else " " for letter in text)[:MAX_LABEL_LENGTH]
+    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def show_result(folder: Path) -> None:
