@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Python compiles what is imported; compiling all that is installed takes a minute.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO := demo
 # Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
 # share (tests/conftest.py), and files begin in their order, the long ones of tests/accuracy first.
@@ -91,7 +93,7 @@ test-install: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -x -v tests/install $(ARGS)
 
 lock: $(VENV)/dev.stamp
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'uv>=0.5'
+	$(PIP) 'uv>=0.5'
 	$(BIN)/python deploy/package/update_lock.py
 
 # The benchmarks of fit and measurements render held-out bodies, which needs
@@ -109,18 +111,17 @@ $(VENV)/system.stamp: deploy/apt-packages.txt deploy/install-system.sh
 	touch $@
 
 $(VENV)/runtime.stamp: $(VENV)/system.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[simulation]'
+	$(PIP) --editable '.[simulation]'
 	@echo "compiling in advance, so that the first scan does not have to wait"
 	$(BIN)/python -c "from workers.reconstruct.job import warm_up; warm_up()"
 	touch $@
 
 $(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,simulation]'
+	$(PIP) --editable '.[dev,simulation]'
 	touch $@ $(VENV)/runtime.stamp
 
 $(VENV)/train.stamp: $(VENV)/dev.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'torch==2.13.0'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,train,simulation]'
+	$(PIP) 'torch==2.13.0' --editable '.[dev,train,simulation]'
 	touch $@
 
 clean:
