@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles what is imported; compiling all that is installed takes a minute.
+# Python compiles what is imported, and keeps it; compiling all that is installed takes a minute.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO := demo
 # Two processes: most tests keep one core busy. A file stays in one of them, with what its tests
