@@ -6,6 +6,7 @@ prints it, control's `status` command returns it, and the metrics are made from 
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Mapping, Set
@@ -13,11 +14,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from station.booth.collection import check_words, silence_in_words
+from station.booth.scan_writer import booth_rig
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
+from station.core.errors import BoothError
 from station.core.scans import STATES, count_scans
-from station.core.service import NOTHING_RUNS, anything_runs, read_health
+from station.core.service import NOTHING_RUNS, read_health
 
 MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""
@@ -49,12 +52,10 @@ class BoothHealth:
 def booth_health(config: BoothConfig) -> BoothHealth:
     """The booth as it is now; what cannot be read is a problem of its own."""
     folder = config.runtime.folder
-    # Reports of a booth that was stopped a moment ago are as fresh as those of one that runs.
-    runs = anything_runs(folder)
-    processes = {
-        service.name: read_health(folder, service.name) if runs else {}
-        for service in services(config)
-    }
+    processes = {service.name: read_health(folder, service.name) for service in services(config)}
+    if not any(map(_lives, processes.values())):
+        # Reports of a booth that was stopped a moment ago are as fresh as those of one that runs.
+        processes = {name: {} for name in processes}
     problems = _silent(processes)
     sync = processes["sync"]
     if not reports(sync):
@@ -75,6 +76,17 @@ def booth_health(config: BoothConfig) -> BoothHealth:
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
 
 
+def _lives(content: Mapping[str, Any]) -> bool:
+    """Whether the process lives that wrote a report."""
+    try:
+        os.kill(content["pid"], 0)
+    except (KeyError, ProcessLookupError):
+        return False
+    except PermissionError:
+        pass  # another user's
+    return True
+
+
 def reports(content: Mapping[str, Any]) -> bool:
     """A process's last report is fresh; what an older one says may have passed."""
     return bool(content) and content["age_s"] <= MAX_AGE_S
@@ -90,13 +102,26 @@ def starting(processes: Mapping[str, Mapping[str, Any]]) -> set[str]:
 
 
 def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
-    """Whether nothing is in the way of a scan, from control's answer: no silence, a calibration.
+    """Whether nothing is in the way of a scan, from control's answer.
 
     Sensors that were stopped are expected to be silent.
     """
-    silent = status["sync"].get("silent", ["unknown"]) if status["streaming"] else []
-    processes = status["processes"].values()
-    return all(map(reports, processes)) and not silent and config.calibration.exists()
+    sync = status["sync"]
+    silent = sync.get("silent", ["unknown"]) if status["streaming"] else []
+    troubled = any(camera["trouble"] for camera in sync.get("cameras", {}).values())
+    # A booth that has never run has no spool yet.
+    full = status["free_bytes"] < config.spool.min_free_mb * 1e6 and config.spool.folder.is_dir()
+    disturbed = silent or troubled or full or sync.get("problems") or unusable(config)
+    return all(map(reports, status["processes"].values())) and not disturbed
+
+
+def unusable(config: BoothConfig) -> str:
+    """Words on a calibration that no scan can be taken with; empty if it is sound."""
+    try:
+        booth_rig(config)
+    except BoothError as error:
+        return str(error)
+    return ""
 
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:

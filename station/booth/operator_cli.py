@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import booth_health, can_scan, reports, starting
+from station.booth.health import booth_health, can_scan, reports, starting, unusable
 from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -22,9 +22,9 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
-from station.core.service import NOTHING_RUNS, STATION_LOCK, anything_runs
+from station.core.service import NOTHING_RUNS, STATION_LOCK
 from station.messaging.messages import Request
-from station.messaging.transport import NoAnswerError, ask
+from station.messaging.transport import NoAnswerError, NothingRunsError, ask, ask_again
 
 _POLL_S = 0.05
 _BEGINS_S = 3.0
@@ -64,8 +64,7 @@ def start(config_path: Path | None, timeout_s: float) -> None:
       station start
     """
     config = load_config(find_config(config_path))
-    _await_station(config.runtime.folder)
-    _command(config, Request("start"))
+    _start(config)
     began_s = time.monotonic()
     deadline_s = began_s + timeout_s
     troubles: dict[str, str] = {}
@@ -90,11 +89,24 @@ def start(config_path: Path | None, timeout_s: float) -> None:
     click.echo(f"{count} camera{'s' if count > 1 else ''} streaming")
 
 
-def _await_station(runtime_folder: Path) -> None:
-    """Give `station run`, begun a moment ago in the same script, the time to show that it runs."""
+def _start(config: BoothConfig) -> None:
+    """Ask control to start the sensors.
+
+    `station run` may have been begun a moment ago in the same script: it is given the time to show
+    that it runs, and its control process the time to answer.
+    """
     deadline_s = time.monotonic() + _BEGINS_S
-    while not anything_runs(runtime_folder) and time.monotonic() < deadline_s:
-        time.sleep(_POLL_S)
+    order, runtime = Request("start"), config.runtime
+    while True:
+        try:
+            reply = ask_again(runtime.folder, "control", order, runtime.command_timeout_s)
+            break
+        except NothingRunsError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(_POLL_S)
+    if not reply.ok:
+        raise BoothError(reply.error)
 
 
 @click.command()
@@ -156,6 +168,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
     if error is not None:
         raise error
     if not can_scan(config, content):
+        if not as_json and config.calibration.exists() and (words := unusable(config)):
+            click.echo(f"! {words}")
         sys.exit(_EXIT_NO_SCANS)
 
 
@@ -193,7 +207,7 @@ def _show_status(content: Mapping[str, Any]) -> None:
         f"spool: {', '.join(f'{n} {state}' for state, n in counts.items()) or 'empty'}{free}"
     )
     for problem in content["problems"]:
-        if problem != NOTHING_RUNS:  # told as the error
+        if problem != NOTHING_RUNS or content["streaming"] is not None:  # else told as the error
             click.echo(f"! {problem}")
 
 
@@ -295,6 +309,8 @@ def _follow(
                 words += f" ({time.monotonic() - begun_s:.0f} s)"
             if session["reason"] == UNSURE:
                 words = UNSURE
+            if session["reason"] == CANCELLED:
+                words = "cancelled"
             line.show(words, changes=words.startswith(_CHANGING))
             if enough(state):
                 return session
@@ -307,7 +323,7 @@ def _follow(
             # The order itself may not have been recorded; repeated, it is the same scan.
             unsure = session["reason"] == UNSURE
             request = order if unsure else Request("scan-status", scan_id)
-            session = _ask_until_answered(config, request)
+            session = _ask_until_answered(config, request, line)
 
 
 class _Line:
@@ -338,8 +354,13 @@ class UnsureError(BoothError):
         super().__init__(f"scan {scan_id}: {UNSURE}; see station status and station find {scan_id}")
 
 
-def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]:
+def _ask_until_answered(
+    config: BoothConfig, request: Request, line: _Line | None = None
+) -> dict[str, Any]:
     """Control's reply about a scan, retried until it arrives: a repeated order is the same scan.
+
+    Args:
+        line: where the scan's state is shown; the order was received then.
 
     Raises:
         UnsureError: it did not arrive; the scan may be taken anyway.
@@ -351,12 +372,15 @@ def _ask_until_answered(config: BoothConfig, request: Request) -> dict[str, Any]
         try:
             return _command(config, request)
         except NoAnswerError:
-            if not told and not any(is_held(config.runtime.folder / lock) for lock in _LOCKS):
+            runs = any(is_held(config.runtime.folder / lock) for lock in _LOCKS)
+            if not (told or line or runs):
                 # No station is running here: nobody received the order.
                 raise
             if time.monotonic() > deadline_s:
                 raise UnsureError(request.scan_id) from None
             if not told:
+                if line is not None:
+                    line.close()
                 click.echo(f"  {UNSURE}", err=True)
             told = True
             time.sleep(_POLL_S)

@@ -143,17 +143,7 @@ class ScanWriter:
             self._events.put(Ended(order.scan_id, True, ""))
             return
         spool.check_space(self._config.spool.min_free_mb)
-        rig = Rig.load(self._config.calibration)
-        for name in self._names:
-            rig.camera(name, str(self._config.calibration))
-        if others := [name for name in rig.cameras if name not in self._names]:
-            raise CalibrationError(
-                f"camera {others[0]} was calibrated and is not in booth.toml: put it back, or "
-                "calibrate the booth again"
-                if len(others) == 1
-                else f"cameras {', '.join(others)} were calibrated and are not in booth.toml: put "
-                "them back, or calibrate the booth again"
-            )
+        rig = booth_rig(self._config)
         note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
         spool.notes.write(note, durable=False)
         if order.late(time.monotonic()):
@@ -284,3 +274,24 @@ def _captured(collection: Collection, name: str) -> list[CapturedFrame]:
         )
         for frame in frames
     ]
+
+
+def booth_rig(config: BoothConfig) -> Rig:
+    """The calibration in use, which is of the booth's cameras and no others.
+
+    Raises:
+        BoothError: it is not, or cannot be read.
+    """
+    rig = Rig.load(config.calibration)
+    names = [camera.name for camera in config.cameras]
+    for name in names:
+        rig.camera(name, str(config.calibration))
+    if others := [name for name in rig.cameras if name not in names]:
+        raise CalibrationError(
+            f"camera {others[0]} was calibrated and is not in booth.toml: put it back, or "
+            "calibrate the booth again"
+            if len(others) == 1
+            else f"cameras {', '.join(others)} were calibrated and are not in booth.toml: put "
+            "them back, or calibrate the booth again"
+        )
+    return rig

@@ -112,7 +112,7 @@ def held(path: Path, busy: BoothError) -> Iterator[None]:
 def is_held(path: Path) -> bool:
     """Whether a living process holds a lock file (see `held`)."""
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return False
     try:

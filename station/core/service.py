@@ -35,7 +35,7 @@ _LOCK = ".lock"
 STATION_LOCK = f"station{_LOCK}"
 """Held by `station run` in the runtime folder."""
 NOTHING_RUNS = (
-    "no process of the booth is running here; start it with: station run, or an installed booth "
+    "the booth is not running here; start it with: station run, or an installed booth "
     "with: sudo systemctl start booth.target"
 )
 HEALTH = "health"

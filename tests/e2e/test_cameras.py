@@ -172,7 +172,7 @@ def test_status_without_a_station_ends_with_the_remedy(booth: Path, tmp_path: Pa
         capture_output=True, text=True, timeout=20, check=False,
     )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr.startswith("error: no process of the booth is running here; start it with")
+    assert done.stderr.startswith("error: the booth is not running here; start it with")
     assert done.stdout.startswith("spool: 1 outbox;")
     assert len(done.stdout.splitlines()) == 1
 

@@ -166,8 +166,10 @@ def test_calibrations_that_were_given_up_are_listed(config: Path, store: Calibra
     # One that was killed while it began has nothing that could be listed.
     session.folder.mkdir()
     store.set_aside()
+    # A damaged one hides no other.
+    (store.folder / "abandoned-11" / "session.json").mkdir(parents=True)
     lines = _run(config, "--list").output.splitlines()
-    assert lines[0] == f"  abandoned-1  given up, started {local_time(STARTED)}: nothing yet"
+    assert lines[0] == f"  abandoned-1  given up, started {local_time(STARTED)}"
     assert [line.split()[0] for line in lines] == [f"abandoned-{n}" for n in range(1, 11)]
 
 

@@ -53,7 +53,25 @@ def test_a_session_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert again.lensed_cameras()["front-lower"].K[0, 0] == 585.0
     assert again.background("front-lower") is not None
     assert again.background("back-lower") is None
-    again.forget_balls()
+
+
+def test_the_ball_waved_anew_replaces_the_old_one_in_one_line(tmp_path: Path) -> None:
+    """Killed between two lines, or on a full disk, a calibration had neither."""
+    session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    session.record_balls([ball("front-lower", 1.0), ball("front-lower", 2.0)])
+    path = tmp_path / JOURNAL
+    before = path.read_bytes()
+    session.begin_run()
+    begun = path.read_bytes()
+    session.record_balls([ball("front-upper", 7.0)], again=True)
+    session.record_balls([ball("front-upper", 8.0)])
+    whole = path.read_bytes()
+    assert [ball.time_s for ball in Session.load(tmp_path).balls] == [7.0, 8.0]
+    for end in range(len(begun), len(whole)):
+        path.write_bytes(whole[:end])
+        assert Session.load(tmp_path).balls
+    # As earlier versions wrote it.
+    path.write_bytes(before + b'{"step":"forget-balls"}\n')
     assert Session.load(tmp_path).balls == []
 
 

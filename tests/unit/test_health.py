@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,17 @@ import pytest
 from click.testing import CliRunner
 
 from station.booth import operator_cli
-from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting
+from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
+from station.core.rig import Rig
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
+from station.simulation.scene import default_rig
 
 _CAMERAS = ("a", "b")
 
@@ -36,16 +39,22 @@ def config(tmp_path: Path) -> Iterator[BoothConfig]:
         for name in _CAMERAS
     )
     (tmp_path / "booth.toml").write_text(f"{cameras}[console]\nenabled = false\n")
-    (tmp_path / "calibration.json").touch()
     config = load_config(tmp_path / "booth.toml")
+    _calibrate(config, _CAMERAS)
     with held(config.runtime.folder / STATION_LOCK, BoothError("held")):
         yield config
+
+
+def _calibrate(config: BoothConfig, names: Sequence[str]) -> None:
+    lenses = default_rig().cameras.values()
+    cameras = {name: replace(lens, name=name) for name, lens in zip(names, lenses, strict=False)}
+    Rig("2026-11-21T10:00:00Z", names[0], cameras, 0.0).save(config.calibration)
 
 
 def _tell(config: BoothConfig, process: str, age_s: float = 0.0, **content: Any) -> None:
     folder = config.runtime.folder / HEALTH
     folder.mkdir(parents=True, exist_ok=True)
-    document = {"told_s": time.monotonic() - age_s, **content}
+    document = {"pid": os.getpid(), "told_s": time.monotonic() - age_s, **content}
     (folder / f"{file_name(process)}.json").write_text(json.dumps(document))
 
 
@@ -111,7 +120,7 @@ def test_a_booth_that_was_stopped_is_told_in_one_sentence(config: BoothConfig) -
         _tell(config, process, age_s=60.0)
     _tell(config, "sync", age_s=60.0, problems=["the spool's disk has not answered for 4 s"])
     (problem,) = booth_health(config).problems
-    assert problem.startswith("no process of the booth is running here; start it with: station run")
+    assert problem.startswith("the booth is not running here; start it with: station run")
     _tell(config, "control")
     assert len(booth_health(config).problems) == 4
 
@@ -186,6 +195,36 @@ def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
     assert code(streaming=False, silent=["a"]) == 0
     config.calibration.unlink()
     assert code(streaming=True) == 1
+
+
+@pytest.mark.parametrize(
+    "sync",
+    [
+        {"problems": ["camera a is sensor 2, but 1 was calibrated"]},
+        {"cameras": {"a": _camera("streaming", trouble="it keeps sending the same picture")}},
+    ],
+)
+def test_what_a_scan_is_refused_for_is_in_its_way(config: BoothConfig, sync: Any) -> None:
+    _problems(config, streaming=True, silent=[], **sync)
+    assert not can_scan(config, {**asdict(booth_health(config)), "streaming": True})
+
+
+def test_a_calibration_of_other_cameras_and_a_full_disk_are_in_the_way_of_scans(
+    config: BoothConfig,
+) -> None:
+    """The exit code of status was 0, and every scan was refused."""
+    _problems(config, streaming=True, silent=[], cameras={})
+    told = {**asdict(booth_health(config)), "streaming": True}
+    assert can_scan(config, told)
+    assert unusable(config) == ""
+    _calibrate(config, ("a", "b", "c"))
+    assert unusable(config).startswith("camera c was calibrated and is not in booth.toml")
+    assert not can_scan(config, told)
+    config.calibration.write_text('{"format": "booth-cal')
+    assert not can_scan(config, told)
+    _calibrate(config, _CAMERAS)
+    config.spool.folder.mkdir()
+    assert not can_scan(config, {**told, "free_bytes": 10_000})
 
 
 def test_a_silent_process_is_in_the_way_of_scans(config: BoothConfig) -> None:

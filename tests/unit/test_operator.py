@@ -2,8 +2,12 @@
 
 import itertools
 import json
+import math
+import os
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,8 +21,10 @@ from station.booth.operator_cli import _follow, cancel, scan, show_result, start
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import held
+from station.core.scans import CANCELLED
 from station.core.service import HEALTH, STATION_LOCK
-from station.messaging.messages import Request
+from station.messaging.messages import Reply, Request
+from station.messaging.transport import NothingRunsError
 
 
 def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
@@ -69,7 +75,7 @@ def _report(config: BoothConfig, process: str, **content: Any) -> None:
     """The report that a process wrote just now."""
     folder = config.runtime.folder / HEALTH
     folder.mkdir(parents=True, exist_ok=True)
-    document = {"told_s": time.monotonic(), **content}
+    document = {"pid": os.getpid(), "told_s": time.monotonic(), **content}
     (folder / f"{process}.json").write_text(json.dumps(document))
 
 
@@ -81,13 +87,15 @@ def test_a_booth_that_does_not_run_is_told_at_once(
     words = ["some-scan"] if command is cancel else []
     done = _run(command, one_camera, *words)
     assert isinstance(done.exception, BoothError)
-    assert str(done.exception).startswith("no process of the booth is running here; start it with")
+    assert str(done.exception).startswith("the booth is not running here; start it with")
 
 
 def test_a_booth_that_was_just_stopped_has_no_processes(one_camera: BoothConfig) -> None:
     """Their last reports are as fresh as those of a booth that runs."""
+    ended = subprocess.Popen(["true"])
+    ended.wait()
     for process in ("control", "sync"):
-        _report(one_camera, process)
+        _report(one_camera, process, pid=ended.pid)
     shown = _run(status, one_camera).output
     assert "running" not in shown
     assert "SILENT" not in shown
@@ -146,3 +154,51 @@ def test_a_long_label_is_refused_by_control_and_not_cut_here(
     done = _run(scan, one_camera, "--label", 300 * "x")
     assert str(done.exception) == "the label has 300 characters"
     assert told == [300 * "x"]
+
+
+def test_a_station_that_was_just_begun_is_waited_for(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`station run & station start` in a script."""
+    answers: Iterator[Reply | NothingRunsError] = iter(
+        [NothingRunsError(), NothingRunsError(), Reply(ok=False, error="it answered")]
+    )
+
+    def asked(*_: object) -> Reply:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(operator_cli, "ask_again", asked)
+    assert str(_run(start, one_camera).exception) == "it answered"
+
+
+def test_a_scan_that_was_accepted_outlives_the_station(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command ended at once, with no word on the scan."""
+    session = {"state": "accepted", "reason": "", "wanted": 0, "framesets": 0}
+    answers: Iterator[dict[str, Any] | NothingRunsError] = iter(
+        [NothingRunsError(), {**session, "state": "delivered"}]
+    )
+
+    def told(*_: object) -> dict[str, Any]:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(operator_cli, "_command", told)
+    order = Request("scan", "a")
+    done = _follow(one_camera, order, session, lambda state: state == "delivered", math.inf)
+    assert done["state"] == "delivered"
+    assert "outcome not known yet" in capsys.readouterr().err
+
+
+def test_a_cancelled_scan_is_not_said_to_have_failed(
+    one_camera: BoothConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = {"state": "failed", "reason": CANCELLED, "wanted": 0, "framesets": 0}
+    _follow(one_camera, Request("scan", "a"), session, lambda _: True, math.inf)
+    assert capsys.readouterr().out.split() == ["cancelled"]

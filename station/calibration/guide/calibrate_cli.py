@@ -20,7 +20,6 @@ from station.core.files import local_time
 # several on a busy station.
 if TYPE_CHECKING:
     from station.calibration.guide.procedure import Procedure
-    from station.calibration.guide.session import Session
 
 
 _SIDE = Number(0.001, 1.0, unit="metres")
@@ -157,16 +156,13 @@ def _list(procedure: Procedure) -> None:
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms{accuracy}"
         )
-    for other in given_up:
-        click.echo(f"  {other.folder.name}  {_begun('given up', other)}")
+    for name, started in given_up:
+        click.echo(f"  {name}  given up, started {local_time(started)}")
     if session is not None:
-        click.echo(f"  {_begun('unfinished', session)}")
-
-
-def _begun(state: str, session: Session) -> str:
-    """Words on a calibration that is not solved."""
-    origin = f", added to {session.adds_to}" if session.adds_to else ""
-    return f"{state}, started {local_time(session.started)}{origin}: {session.summary()}"
+        origin = f", added to {session.adds_to}" if session.adds_to else ""
+        click.echo(
+            f"  unfinished, started {local_time(session.started)}{origin}: {session.summary()}"
+        )
 
 
 @calibrate.command("floor")

@@ -26,7 +26,7 @@ from station.calibration.guide.steps import (
     wave_ball,
 )
 from station.core.errors import CalibrationError
-from station.core.files import utc_now
+from station.core.files import local_time, utc_now
 
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
 _MAX_BOARDS, _MAX_PLACES = 20, 20
@@ -55,8 +55,8 @@ class Procedure(Attempt):
         if session is not None:
             session.check_configured([camera.name for camera in self.config.cameras])
             self.guide.say(
-                f"continuing the calibration that was started at {session.started}; if a camera "
-                "was moved since, begin anew: station calibrate --new"
+                f"continuing the calibration that was started at {local_time(session.started)}; if "
+                "a camera was moved since, begin anew: station calibrate --new"
             )
             self.guide.say(f"already recorded: {session.summary()}")
             self.guide.say("to repeat a step, run its own command")

@@ -22,6 +22,7 @@ from station.calibration.detect.step_names import (
     raised_height_m,
 )
 from station.core.errors import CalibrationError
+from station.core.files import local_time
 from station.core.rig import CameraCalibration
 
 _SAME_HEIGHT_M = 0.15
@@ -68,8 +69,8 @@ class Seen:
             if then != now:
                 raise CalibrationError(
                     f"camera {name} is {now or 'not configured'} now and was {then or 'not there'} "
-                    f"when this calibration was started ({self.started}); start again with "
-                    "station calibrate --new"
+                    f"when this calibration was started ({local_time(self.started)}); start again "
+                    "with station calibrate --new"
                 )
 
     def check_configured(self, names: Collection[str]) -> None:
@@ -80,7 +81,7 @@ class Seen:
         """
         if set(names) != set(self.cameras):
             raise CalibrationError(
-                f"this calibration was started ({self.started}) with the cameras "
+                f"this calibration was started ({local_time(self.started)}) with the cameras "
                 f"{', '.join(self.cameras)}, and booth.toml has {', '.join(names)}; put booth.toml "
                 "right, or start again with station calibrate --new"
             )
@@ -93,8 +94,8 @@ class Seen:
         """
         if self.radius_m != radius_m:
             raise CalibrationError(
-                f"the calibration that was started at {self.started} uses a ball with a radius of "
-                f"{self.radius_m:g} m, but booth.toml says {radius_m:g} m "
+                f"the calibration that was started at {local_time(self.started)} uses a ball with "
+                f"a radius of {self.radius_m:g} m, but booth.toml says {radius_m:g} m "
                 "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
                 "with station calibrate --new"
             )

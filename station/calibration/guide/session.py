@@ -43,7 +43,9 @@ JOURNAL, SCENE = "observations.jsonl", "scene"
 
 Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
-_FORGET_RAISED, _REPLAYED = "forget-raised", "ball-replayed"
+_FORGET_RAISED, _REPLAYED, _BALL_AGAIN = "forget-raised", "ball-replayed", "ball-again"
+_FORGET_BALLS = "forget-balls"
+"""Of earlier versions, which forgot the waved ball before it was seen anew."""
 _NO_ENTRY = (
     ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
 )  # fmt: skip
@@ -81,6 +83,11 @@ class Session(Seen):
         path = folder / SESSION
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         write_json(path, {**document, "adds_to": adds_to})
+
+    @staticmethod
+    def begun(folder: Path) -> str:
+        """When a calibration was begun, without reading what it has seen."""
+        return str(read_json(folder / SESSION, format=FORMAT, versions=VERSIONS).get("started"))
 
     @classmethod
     def load(cls, folder: Path) -> Session:
@@ -131,19 +138,17 @@ class Session(Seen):
         """Start another run of waving, whose times are unrelated to those before."""
         self._append({"step": "run"})
 
-    def record_balls(self, balls: Sequence[BallDetection]) -> None:
-        """The waved ball, since the last call."""
+    def record_balls(self, balls: Sequence[BallDetection], *, again: bool = False) -> None:
+        """The waved ball, since the last call; ``again``: in place of all that was seen of it, as
+        one line, so that nothing is lost before there is something new."""
         if balls:
-            self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
+            step = _BALL_AGAIN if again else BALL
+            self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
 
     def end_replay(self, recording: str) -> None:
         """A recording (its fingerprint) of the waved ball was looked at to its end: it shows
         nothing more."""
         self._append({"step": _REPLAYED, "recording": recording})
-
-    def forget_balls(self) -> None:
-        """Wave from the beginning: another radius, a ball that slipped."""
-        self._append({"step": "forget-balls"})
 
     def forget_raised(self, places: Sequence[str]) -> None:
         """Forget the ball at some heights, which were measured wrongly."""
@@ -196,7 +201,7 @@ class Session(Seen):
             self.replayed = ""
         elif step == _REPLAYED:
             self.replayed = str(entry["recording"])
-        elif step == "forget-balls":
+        elif step == _FORGET_BALLS:
             self.balls.clear()
             self.replayed = ""
         elif step == _FORGET_RAISED:
@@ -204,8 +209,12 @@ class Session(Seen):
                 raise ValueError("places are a list")
             for place in entry["places"]:
                 self.around.pop(str(place), None)
-        elif step == BALL:
+        elif step in (BALL, _BALL_AGAIN):
             seen = self._balls(entry)
+            if step == _BALL_AGAIN:
+                self.balls.clear()
+                self.replayed = ""
+                self._later_s = None
             later_s = self._moved_by(min(ball.time_s for ball in seen))
             self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
         elif step in (MARK, FRONT):

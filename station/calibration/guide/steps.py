@@ -255,10 +255,8 @@ def wave_ball(
         # Emptied first: whatever interrupts the writing, nothing is written twice.
         seen = list(waiting)
         waiting.clear()
-        if again and seen:
-            again = False
-            session.forget_balls()
-        session.record_balls(seen)
+        session.record_balls(seen, again=again)
+        again = again and not seen
 
     began_s = written_s = time.monotonic()
     with BallFinder(session, every_frame=feed.replays, held=True) as finder:

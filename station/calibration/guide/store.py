@@ -83,8 +83,9 @@ class CalibrationStore:
             found.append(Entry(folder.name, folder, rig, self._is_used(folder)))
         return found
 
-    def given_up(self) -> list[Session]:
-        """Calibrations that were set aside before they were solved, in that order.
+    def given_up(self) -> list[tuple[str, str]]:
+        """Folders of calibrations that were set aside before they were solved, and when each was
+        begun, in that order.
 
         One that was killed while it began has no session: nothing was seen in it.
         """
@@ -92,8 +93,8 @@ class CalibrationStore:
         begun = [path.parent for path in self.folder.glob(f"{_ABANDONED}*/{SESSION}")]
         for folder in sorted(begun, key=lambda folder: (len(folder.name), folder.name)):
             try:
-                found.append(Session.load(folder))
-            except FormatError as cause:
+                found.append((folder.name, Session.begun(folder)))
+            except (FormatError, OSError) as cause:
                 _log.warning("  %s  cannot be read: %s", folder.name, cause)
         return found
 
@@ -230,8 +231,8 @@ def _check_cameras(calibration: str, rig: Rig, cameras: Sequence[CameraConfig]) 
         )
     for camera in cameras:
         # Not every driver's cameras have serial numbers.
-        now, then = str(getattr(camera, "serial", "")), rig.cameras[camera.name].serial
-        if is_serial(now) and is_serial(then) and now != then:
+        now, then = getattr(camera, "serial", None), rig.cameras[camera.name].serial
+        if isinstance(now, str) and is_serial(now) and is_serial(then) and now != then:
             raise CalibrationError(
                 f"camera {camera.name} was sensor {then} at calibration {calibration}, and "
                 f"booth.toml has {now}: {remedy}"
