@@ -45,7 +45,7 @@ Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
 _FORGET_RAISED, _REPLAYED, _BALL_AGAIN = "forget-raised", "ball-replayed", "ball-again"
 _FORGET_BALLS = "forget-balls"
-"""Of earlier versions, which forgot the waved ball before it was seen anew."""
+"""Entry of earlier versions, which forgot the waved ball before it was seen anew."""
 _NO_ENTRY = (
     ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, FormatError,
 )  # fmt: skip
@@ -86,7 +86,7 @@ class Session(Seen):
 
     @staticmethod
     def begun(folder: Path) -> str:
-        """When a calibration was begun, without reading what it has seen."""
+        """Moment at which a calibration was begun, without reading what it has seen."""
         return str(read_json(folder / SESSION, format=FORMAT, versions=VERSIONS).get("started"))
 
     @classmethod
