@@ -18,6 +18,7 @@ import pytest
 from live_console import API, LiveConsole
 
 from station.archive.surfaces import read_mesh
+from station.core.rig import Rig
 
 README = Path(__file__).parents[2] / "README.md"
 
@@ -191,6 +192,19 @@ def test_errors_say_what_the_commands_say(console: LiveConsole) -> None:
         _problem(client.post("/task/answer", json={"answer": "go"}), 409, "refused")
         _problem(client.put("/scans", json={}), 405, "method-not-allowed")
         _problem(client.post("/calibrations/none/use"), 404, "no-such-calibration")
+
+
+def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole) -> None:
+    rig = Rig.load(console.config.calibration)
+    fewer = dict(list(rig.cameras.items())[:2])
+    entry = console.config.calibrate.folder / "20260101T000000Z"
+    entry.mkdir(parents=True)
+    Rig("2026-01-01T00:00:00Z", rig.reference, fewer, 0.0).save(entry / "calibration.json")
+    before = console.config.calibration.read_bytes()
+    with console.client() as client:
+        problem = _problem(client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible")
+    assert "is of the cameras front-lower, front-upper, and booth.toml has" in problem["detail"]
+    assert console.config.calibration.read_bytes() == before
 
 
 def test_a_killed_camera_is_told_with_its_remedy(console: LiveConsole) -> None:
