@@ -145,8 +145,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
     """Show processes, cameras, framesets and the spool, and what is wrong with them.
 
     Exit code 0: scans can be taken, once the sensors are started if they are stopped; 1: they
-    cannot, because the booth does not run, a process or a camera is silent, or it is not
-    calibrated. What is known is shown either way.
+    cannot, because the booth does not run, a process or a camera is silent or disturbed, the disk
+    is full, or the calibration is missing or of other cameras. What is known is shown either way.
 
     \b
     Examples:
