@@ -110,7 +110,7 @@ def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
     silent = sync.get("silent", ["unknown"]) if status["streaming"] else []
     troubled = any(camera["trouble"] for camera in sync.get("cameras", {}).values())
     # A booth that has never run has no spool yet.
-    full = status["free_bytes"] < config.spool.min_free_mb * 1e6 and config.spool.folder.is_dir()
+    full = config.spool.folder.is_dir() and _is_full(config, status["free_bytes"])
     disturbed = silent or troubled or full or sync.get("problems") or unusable(config)
     return all(map(reports, status["processes"].values())) and not disturbed
 
@@ -167,6 +167,11 @@ def _cameras(
     return problems
 
 
+def _is_full(config: BoothConfig, free_bytes: int) -> bool:
+    """Whether scans are refused for the space that is left."""
+    return free_bytes < config.spool.min_free_mb * 1e6
+
+
 def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], float, list[str], int]:
     """Counts of scans, age of the oldest waiting one, stuck ones, free bytes."""
     folder = config.spool.folder
@@ -186,7 +191,7 @@ def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], flo
     except OSError as error:
         problems.append(f"the spool cannot be read ({error}); check its disk")
         return {}, 0.0, [], 0
-    if free < config.spool.min_free_mb * 1e6:
+    if _is_full(config, free):
         problems.append(
             f"{folder} has {free / 1e6:.0f} MB free and scans are refused below "
             f"{config.spool.min_free_mb:.0f} MB; free some space or run: station purge --old"

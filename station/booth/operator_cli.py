@@ -44,8 +44,10 @@ _WORDS = {
 _CHANGING = (_WORDS["capturing"], _WORDS["reconstructing"])
 
 
-def _command(config: BoothConfig, request: Request) -> dict[str, Any]:
-    reply = ask(config.runtime.folder, "control", request, config.runtime.command_timeout_s)
+def _command(config: BoothConfig, request: Request, *, repeats: bool = False) -> dict[str, Any]:
+    runtime = config.runtime
+    asked = ask_again if repeats else ask
+    reply = asked(runtime.folder, "control", request, runtime.command_timeout_s)
     if not reply.ok:
         raise BoothError(reply.error)
     return reply.content
@@ -96,17 +98,14 @@ def _start(config: BoothConfig) -> None:
     that it runs, and its control process the time to answer.
     """
     deadline_s = time.monotonic() + _BEGINS_S
-    order, runtime = Request("start"), config.runtime
     while True:
         try:
-            reply = ask_again(runtime.folder, "control", order, runtime.command_timeout_s)
-            break
+            _command(config, Request("start"), repeats=True)
+            return
         except NothingRunsError:
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(_POLL_S)
-    if not reply.ok:
-        raise BoothError(reply.error)
 
 
 @click.command()

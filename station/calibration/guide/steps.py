@@ -237,8 +237,9 @@ def wave_ball(
     What was seen is on disk within a second, whatever ends the step. Seconds in which the ball was
     seen before count; ``again``: all that was seen before is forgotten once it is seen anew.
     """
-    coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
-    if not again:
+    if again:
+        coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
+    else:
         coverage = coverage_so_far(session, reference)
         lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
     session.begin_run()
