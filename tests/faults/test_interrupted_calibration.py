@@ -134,7 +134,7 @@ def test_a_ball_waved_anew_replaces_the_one_in_use(config: Path, recordings: Pat
     # A busy machine misses frames of a replay.
     assert 0 < len(Session.load(store.unfinished).balls) < 1.5 * seen
     assert len(Session.load(solved.folder).balls) == seen
-    store.set_aside()
+    store.abandon()
     begun = _run(config, recordings, "floor")
     assert "a new calibration; until it is solved, the other is in use" in begun.stdout
 

@@ -158,18 +158,18 @@ def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore)
     assert listed == f"  unfinished, started {local_time(STARTED)}: nothing yet\n"
 
 
-def test_calibrations_that_were_given_up_are_listed(config: Path, store: CalibrationStore) -> None:
+def test_abandoned_calibrations_are_listed(config: Path, store: CalibrationStore) -> None:
     """Nothing but the folder's name told of them."""
     for _ in range(10):
         session = _begin(store)
-        store.set_aside()
+        store.abandon()
     # One that was killed while it began has nothing that could be listed.
     session.folder.mkdir()
-    store.set_aside()
+    store.abandon()
     # A damaged one hides no other.
     (store.folder / "abandoned-11" / "session.json").mkdir(parents=True)
     lines = _run(config, "--list").output.splitlines()
-    assert lines[0] == f"  abandoned-1  given up, started {local_time(STARTED)}"
+    assert lines[0] == f"  abandoned-1  started {local_time(STARTED)}"
     assert [line.split()[0] for line in lines] == [f"abandoned-{n}" for n in range(1, 11)]
 
 

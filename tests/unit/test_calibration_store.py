@@ -99,11 +99,11 @@ def test_two_do_not_calibrate_at_once(store: CalibrationStore) -> None:
         pass
 
 
-def test_what_was_begun_is_set_aside_not_lost(store: CalibrationStore) -> None:
-    assert store.set_aside() is None
+def test_an_abandoned_calibration_is_kept(store: CalibrationStore) -> None:
+    assert store.abandon() is None
     for number in (1, 2):
         Session.begin(store.unfinished, STARTED, 0.1, CAMERAS)
-        assert store.set_aside() == store.folder / f"abandoned-{number}"
+        assert store.abandon() == store.folder / f"abandoned-{number}"
     assert store.entries() == []
 
 

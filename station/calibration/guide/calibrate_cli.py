@@ -104,7 +104,7 @@ def _step(command: Callable[..., None]) -> Callable[..., Any]:
 @click.group(invoke_without_command=True)
 @click.option("--use", "use_name", metavar="DATE", help="put a stored calibration into use")
 @click.option("--list", "list_them", is_flag=True, help="show the stored calibrations")
-@click.option("--new", is_flag=True, help="start again; the unfinished calibration is set aside")
+@click.option("--new", is_flag=True, help="start over; the unfinished calibration is abandoned")
 @_options
 def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: bool) -> None:
     """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
@@ -132,8 +132,8 @@ def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: 
     else:
         if procedure.recordings is not None:
             check_folder(procedure.recordings)
-        if new and (aside := procedure.store.set_aside()):
-            click.echo(f"what was seen so far is kept in {aside}")
+        if new and (folder := procedure.store.abandon()):
+            click.echo(f"what was seen so far is kept in {folder}")
         procedure.run()
 
 
@@ -141,8 +141,8 @@ def _list(procedure: Procedure) -> None:
     from station.calibration.solve.refusals import SIGMAS_95
 
     entries, session = list(procedure.store.entries()), procedure.unfinished_session()
-    given_up = procedure.store.given_up()
-    if not entries and not given_up and session is None:
+    abandoned = procedure.store.abandoned()
+    if not entries and not abandoned and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
         mark = "*" if entry.in_use else " "
@@ -156,8 +156,8 @@ def _list(procedure: Procedure) -> None:
             f"{mark} {entry.name}  {len(entry.rig.cameras)} cameras, "
             f"{1e3 * entry.rig.residual_rms_m:.2f} mm rms{accuracy}"
         )
-    for name, started in given_up:
-        click.echo(f"  {name}  given up, started {local_time(started)}")
+    for name, started in abandoned:
+        click.echo(f"  {name}  started {local_time(started)}")
     if session is not None:
         origin = f", added to {session.adds_to}" if session.adds_to else ""
         click.echo(

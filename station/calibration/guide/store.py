@@ -2,6 +2,7 @@
 
 calibrations/20261121T100000Z/   calibration.json, report.json, what it was solved from
 calibrations/unfinished/         the one that is being done
+calibrations/abandoned-1/        one that was begun anew before it was solved
 calibrations/calibrate.lock      held by whoever calibrates
 calibration.json                 a copy of the one in use
 """
@@ -83,9 +84,8 @@ class CalibrationStore:
             found.append(Entry(folder.name, folder, rig, self._is_used(folder)))
         return found
 
-    def given_up(self) -> list[tuple[str, str]]:
-        """Folders of calibrations that were set aside before they were solved, and when each was
-        begun, in that order.
+    def abandoned(self) -> list[tuple[str, str]]:
+        """Folders of abandoned calibrations, and when each was begun, in that order.
 
         One that was killed while it began has no session: nothing was seen in it.
         """
@@ -144,7 +144,7 @@ class CalibrationStore:
         for left in self.folder.glob(f".{UNFINISHED}.*"):
             shutil.rmtree(left)
         # A calibration that was killed while it began has no session: nothing was seen in it.
-        self.set_aside()
+        self.abandon()
         copy = self.folder / f".{UNFINISHED}.{os.getpid()}"
         solved = shutil.ignore_patterns(CALIBRATION, REPORT)
         shutil.copytree(self.folder / name, copy, ignore=solved, copy_function=shutil.copyfile)
@@ -152,16 +152,16 @@ class CalibrationStore:
         publish_folder(copy, self.unfinished)
         return Session.load(self.unfinished)
 
-    def set_aside(self) -> Path | None:
-        """Make room for a new calibration; what an unfinished one has seen is kept."""
+    def abandon(self) -> Path | None:
+        """Make room for a new calibration; what the unfinished one has seen is kept."""
         if not self.unfinished.exists():
             return None
         number = 1
-        while (aside := self.folder / f"{_ABANDONED}{number}").exists():
+        while (kept := self.folder / f"{_ABANDONED}{number}").exists():
             number += 1
-        os.rename(self.unfinished, aside)
+        os.rename(self.unfinished, kept)
         fsync_folder(self.folder)
-        return aside
+        return kept
 
     def use(self, name: str, cameras: Sequence[CameraConfig] = ()) -> Entry:
         """Make a stored calibration the one that the booth reads.

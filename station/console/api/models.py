@@ -241,7 +241,9 @@ class NewStep(_Strict):
     step: Literal["all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve"] = (
         "all"
     )
-    new: bool = Field(default=False, description="start over; recorded data are set aside")
+    new: bool = Field(
+        default=False, description="start over; the unfinished calibration is abandoned but kept"
+    )
 
 
 class Answer(_Strict):

@@ -95,7 +95,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
     try:
         with store.locked():
             if new:
-                store.set_aside()
+                store.abandon()
             if alone:
                 procedure.tell_of_replay()
             _do(procedure, step)

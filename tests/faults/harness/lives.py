@@ -178,7 +178,7 @@ def _session(store: CalibrationStore) -> Session:
     try:
         return Session.load(store.unfinished)
     except FormatError:
-        store.set_aside()
+        store.abandon()
         return Session.begin(store.unfinished, "2026-01-02T00:00:00Z", 0.1, _rig().cameras)
 
 
