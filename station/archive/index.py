@@ -19,6 +19,7 @@ from pathlib import Path
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
 from station.core.files import private_file
+from station.core.scans import CANCELLED
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -115,6 +116,14 @@ class ScanIndex:
             query = f"SELECT {_COLUMNS} FROM scans WHERE scan_id = ?"
             row = database.execute(query, [scan_id]).fetchone()
         return None if row is None else _record(row)
+
+    def count_failed(self) -> tuple[int, int]:
+        """Number of scans that failed, and of scans that the operator cancelled."""
+        query = "SELECT reasons = ?, count(*) FROM scans WHERE state = 'failed' GROUP BY 1"
+        with self._open() as database:
+            self._refresh(database)
+            counts = dict(database.execute(query, [json.dumps([CANCELLED])]))
+        return counts.get(0, 0), counts.get(1, 0)
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:

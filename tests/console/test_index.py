@@ -203,6 +203,14 @@ def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:
     assert (found[0]["state"], found[0]["reasons"]) == ("failed", [CANCELLED])
 
 
+def test_cancelled_scans_are_counted_apart(spool: Spool) -> None:
+    """The page counted them among the failed ones."""
+    index = ScanIndex(spool)
+    assert index.count_failed() == (1, 0)
+    assert spool.withdraw("20261120T100000Z-0000", CANCELLED)
+    assert index.count_failed() == (1, 1)
+
+
 @pytest.fixture
 def in_shanghai(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The machine's clock is set to the time of Shanghai, UTC+8."""

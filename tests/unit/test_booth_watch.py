@@ -19,6 +19,8 @@ from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
 from station.core.config_file import load_config
+from station.core.scans import CANCELLED, scan_id_of
+from station.core.spool import Spool
 from station.messaging.messages import CameraHealth
 from station.messaging.transport import publisher
 
@@ -60,6 +62,23 @@ def test_changes_of_folders_are_told(tmp_path: Path) -> None:
     (tmp_path / "here/result").rmdir()
     assert changes.any()
     changes.close()
+
+
+def test_a_cancelled_scan_does_not_count_as_failed(watch: tuple[Watch, EventLog]) -> None:
+    watching, _ = watch
+    spool = Spool(watching._config.spool.folder)
+    for scan_id in ("a", "b", "c"):
+        bundle = spool.temporary(scan_id)
+        bundle.mkdir()
+        spool.submit(bundle, scan_id)
+    assert spool.withdraw(scan_id_of("a"), CANCELLED)
+    assert spool.withdraw(scan_id_of("b"), "the bundle is torn")
+
+    def counts() -> tuple[int, int]:
+        booth = watching.booth()
+        return booth["failed"], booth["cancelled"]
+
+    _until(lambda: counts() == (1, 1))
 
 
 def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> None:

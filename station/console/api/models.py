@@ -73,7 +73,11 @@ class BoothState(BaseModel):
     streaming: bool
     cameras: list[Camera]
     framesets_hz: float | None
-    spool: dict[str, int]
+    spool: dict[str, int] = Field(
+        description="scans in each folder; failed/ has the cancelled ones, too"
+    )
+    failed: int = Field(description="scans in failed/ that were not cancelled")
+    cancelled: int = Field(description="scans in failed/ that the operator cancelled")
     disk_free_mb: float
     disk_needed_mb: float
     calibration: str = Field(description="the calibration in use, by name or date; empty: none")

@@ -65,6 +65,8 @@ class Watch:
         self._rate_hz: float | None = None
         self._framesets: tuple[int, float] | None = None
         self._seen: dict[str, str] | None = None
+        self._failed = (0, 0)
+        """Scans that failed, and scans that were cancelled."""
         self._spool_ns: tuple[int, ...] = ()
         self._stop = threading.Event()
         self._threads = [
@@ -94,6 +96,7 @@ class Watch:
     def booth(self) -> dict[str, Any]:
         """The booth's state as far as it is known now."""
         spool = self._status.get("spool", {})
+        failed, cancelled = self._failed
         usage = shutil.disk_usage(self._config.spool.folder)
         return {
             "running": not self._fault,
@@ -102,6 +105,8 @@ class Watch:
             "cameras": [camera.document() for camera in self._cameras.values()],
             "framesets_hz": self._rate_hz,
             "spool": {place: int(spool.get(place, 0)) for place in (*PLACES, "done")},
+            "failed": failed,
+            "cancelled": cancelled,
             "disk_free_mb": usage.free / 1e6,
             "disk_needed_mb": self._config.spool.min_free_mb,
         }
@@ -194,6 +199,7 @@ class Watch:
         if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
+        self._failed = self._index.count_failed()
         found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}
         states = {scan_id: scan.state for scan_id, scan in found.items()}
         before, self._seen = self._seen, dict(states)

@@ -59,7 +59,8 @@ export async function booth(main) {
     const rows = [
       [t('booth.rate'), state.streaming ? rate : '–'],
       [t('booth.queue'), String(state.spool.queue + state.spool.work)],
-      [t('booth.failed'), String(state.spool.failed)],
+      [t('booth.failed'), String(state.failed)],
+      [t('booth.cancelled'), String(state.cancelled)],
       [t('booth.disk'), `${(state.disk_free_mb / 1000).toFixed(1)} GB`],
       [t('booth.calibration'), calibrated(state.calibration)],
     ];
