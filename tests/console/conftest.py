@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,3 +28,13 @@ def scans(console: LiveConsole) -> list[dict[str, Any]]:
     found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
     assert all(scan["state"] in ("delivered", "rescan") for scan in found), found
     return found
+
+
+@pytest.fixture
+def in_shanghai(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The machine's clock is set to the time of Shanghai, UTC+8."""
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "Asia/Shanghai")
+        time.tzset()
+        yield
+    time.tzset()

@@ -6,8 +6,6 @@ import re
 import shutil
 import sqlite3
 import threading
-import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -209,16 +207,6 @@ def test_cancelled_scans_are_counted_apart(spool: Spool) -> None:
     assert index.count_failed() == (1, 0)
     assert spool.withdraw("20261120T100000Z-0000", CANCELLED)
     assert index.count_failed() == (1, 1)
-
-
-@pytest.fixture
-def in_shanghai(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The machine's clock is set to the time of Shanghai, UTC+8."""
-    with monkeypatch.context() as patch:
-        patch.setenv("TZ", "Asia/Shanghai")
-        time.tzset()
-        yield
-    time.tzset()
 
 
 @pytest.mark.usefixtures("in_shanghai")

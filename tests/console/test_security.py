@@ -8,6 +8,7 @@ import os
 import socket
 import ssl
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,24 @@ def test_tokens_on_the_command_line(tmp_path: Path) -> None:
     assert "orders" in CliRunner().invoke(station, ["token", "list", *option]).output
     assert CliRunner().invoke(station, ["token", "revoke", "orders", *option]).exit_code == 0
     assert Vault(tmp_path / "console").find_token(secret) is None
+
+
+@pytest.mark.usefixtures("in_shanghai")
+def test_a_token_is_listed_with_the_local_day_of_its_end(tmp_path: Path) -> None:
+    """At 20:00 UTC the next day has begun in Shanghai."""
+    from station.cli import station
+
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    end_s = datetime(2030, 1, 1, 20, tzinfo=UTC).timestamp()
+    vault = Vault(tmp_path / "console")
+    vault.make_token("orders", ("scan",), (end_s - time.time()) / 86400.0)
+    vault.make_token("sheets", ("read",), None)
+    listed = CliRunner().invoke(station, ["token", "list", "--config", str(config)]).output
+    assert [line.split("  ")[-1].strip() for line in listed.splitlines()] == [
+        "until 2030-01-02",
+        "does not expire",
+    ]
 
 
 def _status(answer: httpx.Response) -> int:

@@ -167,6 +167,15 @@ def test_a_detection_that_cannot_be_is_named(tmp_path: Path, wrong: dict[str, ob
         Session.load(tmp_path)
 
 
+def test_one_place_is_not_said_in_the_plural(tmp_path: Path) -> None:
+    """It said "1 places around it"."""
+    session = Session.begin(tmp_path, "2026", 0.1, CAMERAS)
+    session.record_resting("around-0", [ball("front-lower", 1.0)])
+    assert session.summary() == "1 place around it"
+    session.record_resting("around-1", [ball("front-lower", 1.0)])
+    assert session.summary() == "2 places around it"
+
+
 @pytest.mark.parametrize(
     "step",
     ["hanging-nan", "hanging-0", "stand-99999", "hanging--700", "standby-1500", "stand-١٨٠٠"],

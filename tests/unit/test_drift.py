@@ -18,7 +18,8 @@ from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.last_check import keep_check, last_check
 from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
 from station.calibration.drift.reference import DriftReference, plane_slopes
-from station.core.errors import FormatError
+from station.core.config_file import load_config
+from station.core.errors import CalibrationError, FormatError
 from station.core.geometry import se3_exp
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.simulation.noise import TrueView, UnitError, observe
@@ -323,6 +324,16 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     last = last_check(tmp_path)
     assert last is not None
     assert (last["moved"], last["changed"]) == ([], ["a"])
+
+
+def test_cameras_without_a_picture_of_the_empty_booth_are_named(tmp_path: Path) -> None:
+    """Several were "camera a, b"."""
+    default_rig().save(tmp_path / "calibration.json")
+    section = '[[cameras]]\nname = "{0}"\ndriver = "recorded"\nrecording = "{0}"\n'
+    for names, words in (("a", "camera a;"), ("ab", "cameras a, b;")):
+        (tmp_path / "booth.toml").write_text("".join(map(section.format, names)))
+        with pytest.raises(CalibrationError, match=f"no picture of the empty booth by {words}"):
+            check_cli._moves(load_config(tmp_path / "booth.toml"), None, quiet=True)
 
 
 def test_cameras_that_share_unseen_directions_are_told_together(
