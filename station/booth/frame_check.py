@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from station.messaging.messages import FrameHeader
 from station.sensors.base import is_serial
+from station.sensors.identity import REMEDY, differences
 
 MIN_RATE_HZ = 25.0
 """A Kinect sends 30; one that falls back to 15 shares its USB controller."""
@@ -90,27 +92,24 @@ class FrameCheck:
         self._trouble, self._trouble_s = trouble, now_s
 
 
-def wrong_sensors(found: dict[str, str], calibrated: dict[str, str]) -> list[str]:
-    """Sentences about sensors that are not those of the calibration, one each.
+def wrong_sensors(found: Mapping[str, str], calibrated: Mapping[str, str]) -> list[str]:
+    """Sentences about sensors that are not those of the calibration, each with its remedy.
 
     Args:
-        found, calibrated: camera -> serial number, as it is now and when it was calibrated.
+        found: camera -> serial number, of those that have sent frames.
+        calibrated: the same when the booth was calibrated.
     """
     wrong = []
     owners: dict[str, str] = {}
     for name, serial in found.items():
-        if not is_serial(serial):
-            continue
-        if serial in owners:
+        if serial in owners and is_serial(serial):
             wrong.append(
                 f"cameras {owners[serial]} and {name} are the same sensor ({serial}); correct the "
                 "serial numbers in booth.toml"
             )
         owners[serial] = name
-        known = calibrated.get(name, "")
-        if is_serial(known) and known != serial:
-            wrong.append(
-                f"camera {name} is sensor {serial}, but {known} was calibrated; "
-                "put the sensors back where they were, or run station calibrate"
-            )
-    return wrong
+    both = [name for name in found if name in calibrated]
+    others = differences(
+        {name: calibrated[name] for name in both}, {name: found[name] for name in both}
+    )
+    return [*wrong, "; ".join([*others, REMEDY])] if others else wrong

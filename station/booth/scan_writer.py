@@ -25,6 +25,7 @@ from station.core.files import utc_now
 from station.core.rig import Rig
 from station.core.scans import ScanId, ScanNote, boot_id
 from station.core.spool import Spool
+from station.sensors.identity import REMEDY, calibrated_serials, configured_serials, differences
 
 T = TypeVar("T")
 _DISK_RETRY_S = 0.5
@@ -277,21 +278,12 @@ def _captured(collection: Collection, name: str) -> list[CapturedFrame]:
 
 
 def booth_rig(config: BoothConfig) -> Rig:
-    """The calibration in use, which is of the booth's cameras and no others.
+    """The calibration in use, which is of the booth's cameras and sensors and no others.
 
     Raises:
         BoothError: it is not, or cannot be read.
     """
     rig = Rig.load(config.calibration)
-    names = [camera.name for camera in config.cameras]
-    for name in names:
-        rig.camera(name, str(config.calibration))
-    if others := [name for name in rig.cameras if name not in names]:
-        raise CalibrationError(
-            f"camera {others[0]} was calibrated and is not in booth.toml: put it back, or "
-            "calibrate the booth again"
-            if len(others) == 1
-            else f"cameras {', '.join(others)} were calibrated and are not in booth.toml: put "
-            "them back, or calibrate the booth again"
-        )
+    if others := differences(calibrated_serials(rig.cameras), configured_serials(config.cameras)):
+        raise CalibrationError("; ".join([*others, REMEDY]))
     return rig

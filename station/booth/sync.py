@@ -37,6 +37,7 @@ from station.core.service import Heartbeat, only_process, stop_event
 from station.messaging.intake import FrameIntake, LiveFrame
 from station.messaging.messages import Reply, Request, ScanEvent
 from station.messaging.transport import publisher, server
+from station.sensors.identity import calibrated_serials
 
 _POLL_MS = 20
 _LATENCIES_KEPT = 2000
@@ -205,8 +206,7 @@ class SyncProcess:
         return NOBODY if empty else ""
 
     def _wrong_sensors(self, rig: Rig) -> list[str]:
-        known = {name: rig.cameras[name].serial for name in self._names if name in rig.cameras}
-        return wrong_sensors(self._serials, known)
+        return wrong_sensors(self._serials, calibrated_serials(rig.cameras))
 
     def _answer(self) -> None:
         *route, packed = self._commands.recv_multipart()

@@ -203,7 +203,8 @@ def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole
     before = console.config.calibration.read_bytes()
     with console.client() as client:
         problem = _problem(client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible")
-    assert "is of the cameras front-lower, front-upper, and booth.toml has" in problem["detail"]
+    missing = "cameras back-lower, back-upper are in booth.toml and were not calibrated"
+    assert missing in problem["detail"]
     assert console.config.calibration.read_bytes() == before
 
 

@@ -42,7 +42,7 @@ SPEAKERS = (
     "station/calibration/solve/acceptance.py",
     "station/calibration/solve/world.py",
     "station/calibration/solve/predicted.py", "station/calibration/detect/coverage.py",
-    "station/sensors/freenect.py", "station/sensors/recorded.py",
+    "station/sensors/freenect.py", "station/sensors/identity.py", "station/sensors/recorded.py",
     "station/console/live/watch.py", "station/console/live/countdown.py",
     "station/console/live/tasks.py", "station/console/live/guided.py",
     "station/console/api/booth.py", "station/console/api/scans.py",
@@ -142,6 +142,12 @@ SPOKEN = [
     "the ball hanging at 1.8 and 0.7 m",
     "cameras a, b went silent; check their cables; scan again",
     "kept, and not in use yet: the computation puts it into use",
+    "calibration 20261101T100000Z cannot be used: camera a was calibrated and is not in "
+    "booth.toml; cameras b, c are in booth.toml and were not calibrated; put the sensors and "
+    "booth.toml back as they were, or run station calibrate",
+    "the calibration that was started at 2026-11-21 10:00:00 is of other cameras: camera a is "
+    "sensor A2, but A1 was calibrated; put the sensors and booth.toml back as they were, or start "
+    "again with station calibrate --new",
 ]
 
 

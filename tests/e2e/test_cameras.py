@@ -100,7 +100,7 @@ def test_a_camera_absent_from_the_calibration_is_named(
     finally:
         again.close()
     assert refused.returncode == 1
-    assert "camera back-upper is not in" in refused.stderr
+    assert "camera back-upper is in booth.toml and was not" in refused.stderr
 
 
 def test_no_sensor_of_that_serial_is_said_with_a_remedy() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from station.calibration.detect.step_names import EMPTY, MARK, raised_height_m
 from station.calibration.guide.seen import Lens
 from station.calibration.guide.session import JOURNAL, SENSORS, Session
 from station.core.errors import CalibrationError, FormatError
+from station.sensors.identity import calibrated_serials
 
 STARTED = "2026-11-21T10:00:00Z"
 
@@ -110,13 +110,15 @@ def test_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_other_cameras_are_not_mixed_in(tmp_path: Path) -> None:
     session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
-    session.check_cameras(CAMERAS)
-    changed = replace(CAMERAS["back-lower"], serial="X")
-    with pytest.raises(CalibrationError, match="camera back-lower is X now and was V00000003"):
-        session.check_cameras({**CAMERAS, "back-lower": changed})
-    fewer = {name: camera for name, camera in CAMERAS.items() if name != "back-upper"}
-    with pytest.raises(CalibrationError, match="camera back-upper is not configured now"):
-        session.check_cameras(fewer)
+    serials = calibrated_serials(CAMERAS)
+    session.check_cameras(serials)
+    with pytest.raises(CalibrationError, match="camera back-lower is sensor X, but V00000003 was"):
+        session.check_cameras({**serials, "back-lower": "X"})
+    del serials["back-upper"]
+    with pytest.raises(
+        CalibrationError, match=r"camera back-upper was .*with station calibrate --n"
+    ):
+        session.check_cameras(serials)
     assert (tmp_path / SENSORS).exists()
 
 

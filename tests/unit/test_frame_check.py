@@ -74,9 +74,13 @@ def test_half_the_rate_is_named_and_lost_frames_are_not() -> None:
 def test_sensors_that_changed_places_are_named() -> None:
     calibrated = {"front": "A1", "back": "A2"}
     assert wrong_sensors({"front": "A1", "back": "A2"}, calibrated) == []
-    swapped = wrong_sensors({"front": "A2", "back": "A1"}, calibrated)
-    assert len(swapped) == 2
-    assert "camera front is sensor A2, but A1 was calibrated" in swapped[0]
+    (swapped,) = wrong_sensors({"front": "A2", "back": "A1"}, calibrated)
+    assert swapped == (
+        "camera front is sensor A2, but A1 was calibrated; camera back is sensor A1, but A2 was "
+        "calibrated; put the sensors and booth.toml back as they were, or run station calibrate"
+    )
+    # The other has not sent a frame yet.
+    assert wrong_sensors({"front": "A1"}, calibrated) == []
     [twice] = wrong_sensors({"front": "A1", "back": "A1"}, {"front": "A1"})
     assert "the same sensor (A1)" in twice
     assert wrong_sensors({"front": "recorded:front"}, calibrated) == []

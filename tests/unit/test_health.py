@@ -218,8 +218,12 @@ def test_a_calibration_of_other_cameras_and_a_full_disk_are_in_the_way_of_scans(
     assert can_scan(config, told)
     assert unusable(config) == ""
     _calibrate(config, ("a", "b", "c"))
-    assert unusable(config).startswith("camera c was calibrated and is not in booth.toml")
+    assert unusable(config).startswith("camera c was calibrated and is not in booth.toml; put")
     assert not can_scan(config, told)
+    _calibrate(config, ("a", "c", "d"))
+    assert unusable(config).startswith(
+        "cameras c, d were calibrated and are not in booth.toml; camera b is in booth.toml and"
+    )
     config.calibration.write_text('{"format": "booth-cal')
     assert not can_scan(config, told)
     _calibrate(config, _CAMERAS)

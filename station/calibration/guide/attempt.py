@@ -21,6 +21,7 @@ from station.core.files import utc_now
 from station.core.rig import CameraCalibration
 from station.messaging.messages import Request
 from station.messaging.transport import ask_again
+from station.sensors.identity import calibrated_serials
 
 _SENSORS_S = 20.0
 
@@ -130,7 +131,7 @@ class Attempt:
             if self.store.in_use.exists():
                 self.guide.say("a new calibration; until it is solved, the other is in use")
         else:
-            session.check_cameras(cameras)
+            session.check_cameras(calibrated_serials(cameras))
             session.check_radius(self.config.calibrate.ball_radius_m)
         if session.folder != self.store.unfinished:
             session = self.store.reopen(session.folder.name)

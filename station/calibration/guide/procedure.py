@@ -27,6 +27,7 @@ from station.calibration.guide.steps import (
 )
 from station.core.errors import CalibrationError
 from station.core.files import local_time, utc_now
+from station.sensors.identity import configured_serials
 
 _STEPS = (EMPTY, BALL, MARK, FRONT, WALL, *PLACES)
 _MAX_BOARDS, _MAX_PLACES = 20, 20
@@ -53,7 +54,7 @@ class Procedure(Attempt):
                 "them into use, station calibrate --new begins another"
             )
         if session is not None:
-            session.check_configured([camera.name for camera in self.config.cameras])
+            session.check_cameras(configured_serials(self.config.cameras))
             self.guide.say(
                 f"continuing the calibration that was started at {local_time(session.started)}; if "
                 "a camera was moved since, begin anew: station calibrate --new"
@@ -231,7 +232,7 @@ class Procedure(Attempt):
         from station.calibration.solve.solving import solve
 
         session = self.session()
-        session.check_configured([camera.name for camera in self.config.cameras])
+        session.check_cameras(configured_serials(self.config.cameras))
         session.check_radius(self.config.calibrate.ball_radius_m)
         self.guide.title("Solution")
         solution = solve(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from station.calibration.detect.step_names import (
 from station.core.errors import CalibrationError
 from station.core.files import local_time
 from station.core.rig import CameraCalibration
+from station.sensors.identity import calibrated_serials, differences
 
 _SAME_HEIGHT_M = 0.15
 """Heights of the ball that are nearer to each other are a measurement and its correction."""
@@ -57,33 +58,20 @@ class Seen:
     adds_to: str = ""
     """Name of the stored calibration that was taken up again."""
 
-    def check_cameras(self, cameras: Mapping[str, CameraCalibration]) -> None:
+    def check_cameras(self, serials: Mapping[str, str]) -> None:
         """Refuse to mix what two different sets of cameras have seen.
 
-        Raises:
-            CalibrationError: naming the camera that is another one, missing or new.
-        """
-        for name in {**self.cameras, **cameras}:
-            then = self.cameras[name].serial if name in self.cameras else None
-            now = cameras[name].serial if name in cameras else None
-            if then != now:
-                raise CalibrationError(
-                    f"camera {name} is {now or 'not configured'} now and was {then or 'not there'} "
-                    f"when this calibration was started ({local_time(self.started)}); start again "
-                    "with station calibrate --new"
-                )
-
-    def check_configured(self, names: Collection[str]) -> None:
-        """Refuse to solve for other cameras than the booth has.
+        Args:
+            serials: camera -> serial number, of all that the booth has now.
 
         Raises:
-            CalibrationError: with both sets of cameras.
+            CalibrationError: naming the cameras that are others, missing or new.
         """
-        if set(names) != set(self.cameras):
+        if others := differences(calibrated_serials(self.cameras), serials):
             raise CalibrationError(
-                f"this calibration was started ({local_time(self.started)}) with the cameras "
-                f"{', '.join(self.cameras)}, and booth.toml has {', '.join(names)}; put booth.toml "
-                "right, or start again with station calibrate --new"
+                f"the calibration that was started at {local_time(self.started)} is of other "
+                f"cameras: {'; '.join(others)}; put the sensors and booth.toml back as they were, "
+                "or start again with station calibrate --new"
             )
 
     def check_radius(self, radius_m: float) -> None:

@@ -32,7 +32,7 @@ from station.core.files import (
     write_json,
 )
 from station.core.rig import Rig
-from station.sensors.base import is_serial
+from station.sensors.identity import REMEDY, calibrated_serials, configured_serials, differences
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
 _log = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ class CalibrationStore:
 
         Raises:
             CalibrationError: there is none of that name; names those that there are. Or it is of
-                other cameras.
+                other cameras or sensors.
         """
         # A damaged one must not stand in the way of the others.
         folders = {folder.name: folder for folder in self._folders()}
@@ -182,8 +182,11 @@ class CalibrationStore:
             known = ", ".join(folders) or "none"
             raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
         rig = Rig.load(folders[name] / CALIBRATION)
-        if cameras:
-            _check_cameras(name, rig, cameras)
+        others = differences(calibrated_serials(rig.cameras), configured_serials(cameras))
+        if cameras and others:
+            raise CalibrationError(
+                f"calibration {name} cannot be used: {'; '.join(others)}; {REMEDY}"
+            )
         if self.in_use.exists() and not any(map(self._is_used, folders.values())):
             self._adopt()
         write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
@@ -214,29 +217,6 @@ class CalibrationStore:
                 views = [path for path in entries_of(folder / SCENE) if path.suffix == ".npz"]
                 return {path.stem: StaticView.load(path, sizes.get(path.stem)) for path in views}
         return {}
-
-
-def _check_cameras(calibration: str, rig: Rig, cameras: Sequence[CameraConfig]) -> None:
-    """Refuse a calibration of other cameras, or other sensors, than booth.toml names.
-
-    Raises:
-        CalibrationError: naming both.
-    """
-    remedy = "put booth.toml right, or calibrate the booth with station calibrate --new"
-    names = [camera.name for camera in cameras]
-    if set(names) != set(rig.cameras):
-        raise CalibrationError(
-            f"calibration {calibration} is of the cameras {', '.join(rig.cameras)}, and booth.toml "
-            f"has {', '.join(names)}: {remedy}"
-        )
-    for camera in cameras:
-        # Not every driver's cameras have serial numbers.
-        now, then = getattr(camera, "serial", None), rig.cameras[camera.name].serial
-        if isinstance(now, str) and is_serial(now) and is_serial(then) and now != then:
-            raise CalibrationError(
-                f"camera {camera.name} was sensor {then} at calibration {calibration}, and "
-                f"booth.toml has {now}: {remedy}"
-            )
 
 
 def dated(created: str) -> str:
