@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from station.messaging.messages import FrameHeader
 from station.sensors.base import is_serial
-from station.sensors.identity import REMEDY, differences
+from station.sensors.identity import mismatch
 
 MIN_RATE_HZ = 25.0
 """A Kinect sends 30; one that falls back to 15 shares its USB controller."""
@@ -109,7 +109,7 @@ def wrong_sensors(found: Mapping[str, str], calibrated: Mapping[str, str]) -> li
             )
         owners[serial] = name
     both = [name for name in found if name in calibrated]
-    others = differences(
+    words = mismatch(
         {name: calibrated[name] for name in both}, {name: found[name] for name in both}
     )
-    return [*wrong, "; ".join([*others, REMEDY])] if others else wrong
+    return [*wrong, words] if words else wrong

@@ -11,16 +11,19 @@ import shutil
 import time
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from station.booth.collection import check_words, silence_in_words
-from station.booth.scan_writer import booth_rig
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
+from station.core.rig import Rig
 from station.core.scans import STATES, count_scans
 from station.core.service import NOTHING_RUNS, read_health
+from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
 MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""
@@ -69,8 +72,10 @@ def booth_health(config: BoothConfig) -> BoothHealth:
         if reports(content)
         for problem in content.get("problems", [])
     ]
-    if reports(processes["sync"]) and not config.calibration.exists():
-        problems.append("the booth is not calibrated, and takes no scans: run station calibrate")
+    words = unusable(config) if reports(processes["sync"]) else ""
+    # Sync says the same of sensors that it has seen.
+    if words and words not in problems:
+        problems.append(words)
     problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
@@ -117,11 +122,24 @@ def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
 
 def unusable(config: BoothConfig) -> str:
     """Words on a calibration that no scan can be taken with; empty if it is sound."""
+    path = config.calibration
     try:
-        booth_rig(config)
+        file = path.stat()
+        calibrated = _calibrated(path, (file.st_ino, file.st_mtime_ns, file.st_size))
+    except FileNotFoundError:
+        return "the booth is not calibrated, and takes no scans: run station calibrate"
     except BoothError as error:
         return str(error)
-    return ""
+    return mismatch(calibrated, configured_serials(config.cameras))
+
+
+@lru_cache(maxsize=1)
+def _calibrated(path: Path, version: tuple[int, int, int]) -> dict[str, str]:  # noqa: ARG001
+    """Cameras of a calibration and their serial numbers.
+
+    Asked for every second, and read only when the file is another version of it.
+    """
+    return calibrated_serials(Rig.load(path).cameras)
 
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:

@@ -167,7 +167,9 @@ def status(config_path: Path | None, as_json: bool) -> None:
     if error is not None:
         raise error
     if not can_scan(config, content):
-        if not as_json and config.calibration.exists() and (words := unusable(config)):
+        # The station tells it of the booth.toml that it was begun with.
+        words = unusable(config)
+        if not as_json and words and words not in content["problems"]:
             click.echo(f"! {words}")
         sys.exit(_EXIT_NO_SCANS)
 

@@ -25,7 +25,7 @@ from station.core.files import utc_now
 from station.core.rig import Rig
 from station.core.scans import ScanId, ScanNote, boot_id
 from station.core.spool import Spool
-from station.sensors.identity import REMEDY, calibrated_serials, configured_serials, differences
+from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
 T = TypeVar("T")
 _DISK_RETRY_S = 0.5
@@ -284,6 +284,6 @@ def booth_rig(config: BoothConfig) -> Rig:
         BoothError: it is not, or cannot be read.
     """
     rig = Rig.load(config.calibration)
-    if others := differences(calibrated_serials(rig.cameras), configured_serials(config.cameras)):
-        raise CalibrationError("; ".join([*others, REMEDY]))
+    if words := mismatch(calibrated_serials(rig.cameras), configured_serials(config.cameras)):
+        raise CalibrationError(words)
     return rig

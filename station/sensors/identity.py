@@ -8,7 +8,13 @@ from station.core.drivers import CameraConfig
 from station.core.rig import CameraCalibration
 from station.sensors.base import is_serial
 
-REMEDY = "put the sensors and booth.toml back as they were, or run station calibrate"
+_REMEDY = "put the sensors and booth.toml back as they were, or run station calibrate"
+
+
+def mismatch(calibrated: Mapping[str, str], found: Mapping[str, str]) -> str:
+    """All `differences` and what to do about them; empty where there are none."""
+    others = differences(calibrated, found)
+    return "; ".join([*others, _REMEDY]) if others else ""
 
 
 def differences(calibrated: Mapping[str, str], found: Mapping[str, str]) -> list[str]:

@@ -26,6 +26,7 @@ from station.core.rig import Rig
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
+from station.sensors.identity import calibrated_serials
 from station.simulation.scene import default_rig
 
 _CAMERAS = ("a", "b")
@@ -88,7 +89,8 @@ def test_the_remedy_of_several_silent_cameras_is_said_once(config: BoothConfig) 
     cameras = {name: _camera("streaming") for name in _CAMERAS}
     found = _problems(config, streaming=True, silent=["a", "b"], cameras=cameras)
     assert found == ["cameras a, b send no frames; check the recordings"]
-    sensors = tuple(FreenectCamera(name=name, serial=name) for name in _CAMERAS)
+    serials = calibrated_serials(Rig.load(config.calibration).cameras)
+    sensors = tuple(FreenectCamera(name=name, serial=serials[name]) for name in _CAMERAS)
     cabled = config.model_copy(update={"cameras": sensors})
     found = _problems(cabled, streaming=True, silent=["a", "b"], cameras=cameras)
     assert found == ["cameras a, b send no frames; check their cables"]
@@ -197,6 +199,25 @@ def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
     assert code(streaming=True) == 1
 
 
+def test_status_tells_once_that_the_calibration_is_of_other_cameras(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if booth.toml has been edited since the station was begun."""
+    path = config.runtime.folder.parent / "booth.toml"
+
+    def shown(told: Sequence[str]) -> str:
+        health = {**asdict(booth_health(config)), "streaming": True, "problems": told}
+        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=health))
+        return CliRunner().invoke(operator_cli.status, ["--config", str(path)]).output
+
+    _problems(config, streaming=True, silent=[], cameras={})
+    assert "!" not in shown([])
+    path.write_text(path.read_text().replace('name = "b"', 'name = "c"'))
+    _tell(config, "capture c")
+    for told in ([], [unusable(load_config(path))]):
+        assert shown(told).count("! camera b was calibrated and is not in booth.toml") == 1
+
+
 @pytest.mark.parametrize(
     "sync",
     [
@@ -226,9 +247,40 @@ def test_a_calibration_of_other_cameras_and_a_full_disk_are_in_the_way_of_scans(
     )
     config.calibration.write_text('{"format": "booth-cal')
     assert not can_scan(config, told)
+    assert "cannot be read as JSON" in unusable(config)
     _calibrate(config, _CAMERAS)
     config.spool.folder.mkdir()
     assert not can_scan(config, {**told, "free_bytes": 10_000})
+
+
+def test_a_calibration_of_other_cameras_is_a_problem(config: BoothConfig) -> None:
+    """Only the command told it; metrics counted no problem."""
+    assert _problems(config, streaming=True, silent=[], cameras={}) == []
+    _calibrate(config, ("a", "c"))
+    (problem,) = booth_health(config).problems
+    assert problem.startswith("camera c was calibrated and is not in booth.toml; camera b is in")
+    # Sync may say the same of the sensors that it has seen.
+    assert _problems(config, streaming=True, silent=[], cameras={}, problems=[problem]) == [problem]
+
+
+def test_a_calibration_is_read_again_only_when_its_file_changed(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Health is asked for every second."""
+    loaded: list[Path] = []
+    load = Rig.load
+
+    def counted(path: Path) -> Rig:
+        loaded.append(path)
+        return load(path)
+
+    monkeypatch.setattr(Rig, "load", counted)
+    for names, told in ((("a", "c"), True), (_CAMERAS, False)):
+        loaded.clear()
+        _calibrate(config, names)
+        for _ in range(3):
+            assert bool(unusable(config)) == told
+        assert loaded == [config.calibration]
 
 
 def test_a_silent_process_is_in_the_way_of_scans(config: BoothConfig) -> None:

@@ -32,7 +32,7 @@ from station.core.files import (
     write_json,
 )
 from station.core.rig import Rig
-from station.sensors.identity import REMEDY, calibrated_serials, configured_serials, differences
+from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
 CALIBRATION, REPORT, UNFINISHED = "calibration.json", "report.json", "unfinished"
 _log = logging.getLogger(__name__)
@@ -182,11 +182,9 @@ class CalibrationStore:
             known = ", ".join(folders) or "none"
             raise CalibrationError(f"there is no calibration {name} in {self.folder} ({known})")
         rig = Rig.load(folders[name] / CALIBRATION)
-        others = differences(calibrated_serials(rig.cameras), configured_serials(cameras))
-        if cameras and others:
-            raise CalibrationError(
-                f"calibration {name} cannot be used: {'; '.join(others)}; {REMEDY}"
-            )
+        words = mismatch(calibrated_serials(rig.cameras), configured_serials(cameras))
+        if cameras and words:
+            raise CalibrationError(f"calibration {name} cannot be used: {words}")
         if self.in_use.exists() and not any(map(self._is_used, folders.values())):
             self._adopt()
         write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
