@@ -129,9 +129,14 @@ def record_virtual(
         running = {pool.submit(job): what for what, job in jobs.items()}
         for done, job in enumerate(as_completed(running), 1):
             click.echo(f"{done:3} of {len(jobs)}: {running[job]}, {job.result()} frames")
-    finally:
+    except BaseException:
         # Who ends the command does not wait for what is being rendered.
-        pool.shutdown(wait=False, cancel_futures=True)
+        for renderer in multiprocessing.active_children():
+            renderer.kill()
+        raise
+    finally:
+        # Waited for: the pool's semaphores are released, which outlive the process otherwise.
+        pool.shutdown(cancel_futures=True)
     lines = ["# A virtual booth: four replayed Kinects.", ""]
     for name in booth.rig.cameras:
         lines += ["[[cameras]]", f'name = "{name}"', f'driver = "{driver}"']

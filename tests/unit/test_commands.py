@@ -2,6 +2,7 @@ import importlib
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import click
@@ -163,6 +164,27 @@ def test_a_command_that_is_told_to_end_leaves_no_folder(tmp_path: Path) -> None:
         waiting.terminate()
         assert waiting.wait(20.0) == -signal.SIGTERM
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rendering_that_is_told_to_end_leaves_no_semaphores(tmp_path: Path) -> None:
+    """Python complained of five of them after the command had ended."""
+    command = [
+        sys.executable,
+        "-m",
+        "station.cli",
+        "record-virtual",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as rendering:
+        deadline_s = time.monotonic() + 60.0
+        while not list(tmp_path.glob("out/*/d-*.pgm")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        rendering.terminate()
+        _, told = rendering.communicate(timeout=60.0)
+    assert rendering.returncode == -signal.SIGTERM
+    assert told == b""
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
