@@ -50,30 +50,21 @@ class Collection:
         """Metres per unit of its depth images."""
         return next(iter(self.sets[0].frames.values())).header.depth_scale_m
 
-    def too_few(
-        self,
-        silent: Sequence[str],
-        recorded: Set[str],
-        troubles: Sequence[str],
-        within_s: float,
-        tolerance_s: float,
-    ) -> str:
-        """Reason why the framesets did not arrive in time.
 
-        Args:
-            recorded, tolerance_s: as in `check_words` and `too_slow_words`.
-            troubles: what is wrong with cameras that send frames.
-        """
-        if troubles:
-            return "; ".join(troubles)
-        if silent:
-            remedy = check_words(silent, recorded)
-            return (
-                f"camera {silent[0]} went silent; {remedy}; scan again"
-                if len(silent) == 1
-                else f"cameras {', '.join(silent)} went silent; {remedy}; scan again"
-            )
-        return too_slow_words(len(self.sets), self.wanted, within_s, tolerance_s)
+def went_silent_words(silent: Sequence[str], recorded: Set[str]) -> str:
+    """Cause and remedy where cameras stopped sending frames during a scan; empty if none did.
+
+    Args:
+        recorded: as in `check_words`.
+    """
+    if not silent:
+        return ""
+    remedy = check_words(silent, recorded)
+    return (
+        f"camera {silent[0]} went silent; {remedy}; scan again"
+        if len(silent) == 1
+        else f"cameras {', '.join(silent)} went silent; {remedy}; scan again"
+    )
 
 
 def too_slow_words(count: int, wanted: int, within_s: float, tolerance_s: float) -> str:

@@ -19,6 +19,7 @@ from station.booth.collection import (
     check_words,
     silence_in_words,
     too_slow_words,
+    went_silent_words,
 )
 from station.booth.frame_check import FrameCheck, wrong_sensors
 from station.booth.frameset import Frameset, FramesetMatcher
@@ -161,12 +162,10 @@ class SyncProcess:
         if collection is None or time.monotonic() < collection.deadline_s:
             return
         self._collection = None
-        reason = collection.too_few(
-            self._silent(),
-            self._config.recorded,
-            self._troubles(),
-            self._config.scan.max_duration_s,
-            self._config.sync.tolerance_s,
+        reason = (
+            "; ".join(self._troubles())
+            or went_silent_words(self._silent(), self._config.recorded)
+            or self._too_slow_words(len(collection.sets))
         )
         self._fail(collection.order, reason)
 
@@ -194,6 +193,11 @@ class SyncProcess:
         stopped = self._silent_s > since_s or self._intake.silent(_FLOWING_S)
         if count >= scan.framesets or stopped or self._troubles():
             return ""
+        return self._too_slow_words(count)
+
+    def _too_slow_words(self, count: int) -> str:
+        """Words on a scan's time in which so many framesets came."""
+        scan = self._config.scan
         return too_slow_words(
             count, scan.framesets, scan.max_duration_s, self._config.sync.tolerance_s
         )
