@@ -23,6 +23,10 @@ from station.core.kinect_v1 import HEIGHT, TICK_BITS, TICK_HZ, WIDTH
 INDEX = "INDEX.txt"
 _HEADER = f"P5 {WIDTH} {HEIGHT} 65535\n".encode()
 _SHAPE = (HEIGHT, WIDTH)
+_OTHER_PATH = (
+    "correct the recording's path in booth.toml or after --recordings; station record-virtual "
+    "--out FOLDER makes recordings"
+)
 _HALF_TURN_S = 0.5 * 2**TICK_BITS / TICK_HZ
 """Within half a turn of the counter no ticks come again; after a whole one they may."""
 
@@ -88,10 +92,13 @@ def check_recording(folder: Path) -> list[tuple[float, int, Path]]:
     try:
         lines = index.read_text().splitlines()
     except OSError as cause:
-        raise FormatError(
-            f"{index} cannot be read ({cause.strerror}); {folder} is not a recording, "
-            "make one with: station record-virtual --out FOLDER"
-        ) from None
+        gone = isinstance(cause, FileNotFoundError) and not folder.is_dir()
+        what = (
+            f"there is no recording {folder}"
+            if gone
+            else f"{index} cannot be read ({cause.strerror})"
+        )
+        raise FormatError(f"{what}; {_OTHER_PATH}") from None
     except UnicodeDecodeError as cause:
         raise FormatError(f"{index} is not text ({cause}); record again") from None
     frames: list[tuple[float, int, Path]] = []

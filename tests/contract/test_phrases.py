@@ -43,6 +43,7 @@ SPEAKERS = (
     "station/calibration/solve/world.py",
     "station/calibration/solve/predicted.py", "station/calibration/detect/coverage.py",
     "station/sensors/freenect.py", "station/sensors/identity.py", "station/sensors/recorded.py",
+    "station/sensors/recording.py",
     "station/console/live/watch.py", "station/console/live/countdown.py",
     "station/console/live/tasks.py", "station/console/live/guided.py",
     "station/console/api/booth.py", "station/console/api/scans.py",
@@ -141,6 +142,7 @@ SPOKEN = [
     "already recorded: the empty booth; 12 sightings of the waved ball; 1 place around it; "
     "the ball hanging at 1.8 and 0.7 m",
     "cameras a, b went silent; check their cables; scan again",
+    "a/INDEX.txt, line 3: its ticks are those of line 1; record again",
     "kept, and not in use yet: the computation puts it into use",
     "calibration 20261101T100000Z cannot be used: camera a was calibrated and is not in "
     "booth.toml; cameras b, c are in booth.toml and were not calibrated; put the sensors and "

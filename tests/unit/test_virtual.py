@@ -10,6 +10,8 @@ import synthetic_calibration as synthetic
 
 from station.core.errors import DriverError, FormatError, InputError
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
+from station.sensors.freenect import FreenectCamera
+from station.sensors.recorded import RecordedCamera
 from station.sensors.recording import check_recording, read_raw, write_recording
 from station.sensors.registry import make_driver
 from station.simulation.driver import SimulatedCamera
@@ -156,8 +158,20 @@ def test_recordings_come_back_with_their_clock(tmp_path: Path) -> None:
     frames[5][2].write_bytes(b"P5 640 480 65535\n")
     with pytest.raises(FormatError, match="is torn"):
         check_recording(tmp_path / "a")
-    with pytest.raises(FormatError, match="station record-virtual"):
-        check_recording(tmp_path / "b")
+
+
+def test_a_recording_that_is_not_there_says_what_to_do(tmp_path: Path) -> None:
+    """It spoke of a file in the folder that did not exist, and of no wrong path."""
+    missing = tmp_path / "b"
+    with pytest.raises(FormatError, match=f"no recording {missing}; correct the recording's path"):
+        check_recording(missing)
+    missing.mkdir()
+    with pytest.raises(FormatError, match=r"INDEX.txt cannot be read .*station record-virtual --"):
+        check_recording(missing)
+    for kind in (RecordedCamera, FreenectCamera):
+        camera = kind(name="a", recording=tmp_path / "c")
+        with pytest.raises(DriverError, match=f"no recording {tmp_path / 'c'}; correct"):
+            make_driver(camera).open()
 
 
 @pytest.mark.parametrize(
