@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -201,8 +202,12 @@ def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole
     entry.mkdir(parents=True)
     Rig("2026-01-01T00:00:00Z", rig.reference, fewer, 0.0).save(entry / "calibration.json")
     before = console.config.calibration.read_bytes()
-    with console.client() as client:
-        problem = _problem(client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible")
+    try:
+        with console.client() as client:
+            problem = _problem(client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible")
+    finally:
+        # Other tests share the booth, which has no stored calibration.
+        shutil.rmtree(entry)
     missing = "cameras back-lower, back-upper are in booth.toml and were not calibrated"
     assert missing in problem["detail"]
     assert console.config.calibration.read_bytes() == before
