@@ -128,7 +128,7 @@ def unusable(config: BoothConfig) -> str:
         calibrated = _calibrated(path, (file.st_ino, file.st_mtime_ns, file.st_size))
     except FileNotFoundError:
         return "the booth is not calibrated, and takes no scans: run station calibrate"
-    except BoothError as error:
+    except (BoothError, OSError) as error:
         return str(error)
     return mismatch(calibrated, configured_serials(config.cameras))
 
