@@ -21,7 +21,7 @@ from station.simulation.scene import Mesh, box, chair, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from station.simulation.violations import FROZEN
 from workers.cloud.average import average
-from workers.cloud.observed import LOWERED_FLOOR, RAISED_FLOOR
+from workers.cloud.observed import LOWERED_FLOOR, RAISED_FLOOR, TWO_PEOPLE
 from workers.cloud.one_person import cells_of
 from workers.cloud.people import count_people
 from workers.cloud.points import normals, within
@@ -301,7 +301,7 @@ def test_two_people_whose_arms_touch_are_two(tmp_path: Path, apart_m: float) -> 
     booth = SimulatedBooth(seed=1, sway_m=0.0)
     folder = render_bundle(_side_by_side(apart_m), tmp_path / "two", booth, frames=3)
     found = preprocess(read_bundle(folder)).findings
-    assert "two-people" in {finding.code for finding in found}
+    assert TWO_PEOPLE in {finding.code for finding in found}
 
 
 def test_a_chair_apart_is_no_second_person(tmp_path: Path) -> None:

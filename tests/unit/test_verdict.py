@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workers.cloud.observed import RAISED_FLOOR, Finding, PointCloud
+from workers.cloud.observed import RAISED_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
@@ -56,6 +56,16 @@ def test_heights_above_a_mat_are_blank(model: BodyModel) -> None:
     mat = Finding(RAISED_FLOOR, None, 0.012, "there is a mat")
     verdict = judge((), sides, [mat], {}, 1.75, beta, {"a": 0.0}, 1e-3)
     assert (verdict.reasons, verdict.missing) == (("there is a mat",), (FLOOR,))
+
+
+def test_two_people_are_the_only_reason(model: BodyModel) -> None:
+    """Fifteen reasons told what of a body had not been found in the two."""
+    sides, beta = {"front": 0.1, "back": 0.9}, np.full(model.beta_count, 9.0)
+    two = Finding(TWO_PEOPLE, None, None, "two people")
+    lost = {"forearm_left": "the left forearm does not match the scan", "": "things"}
+    verdict = judge((), sides, [two], lost, 2.4, beta, {"a": 0.01}, 1e-3)
+    assert verdict.reasons == ("two people",)
+    assert "forearm_left" in verdict.missing
 
 
 def _elbow_bent(model: BodyModel, degrees: float) -> Array:

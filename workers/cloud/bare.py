@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from workers.cloud.observed import Finding, PointCloud
+from workers.cloud.observed import TWO_PEOPLE, Finding, PointCloud
 from workers.cloud.people import count_people
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def several_people(cloud: PointCloud) -> tuple[Finding, ...]:
     if count_people(cloud.points) < 2:
         return ()
     message = "two people (or a large object) in the cloud: cut one person out"
-    return (Finding("two-people", None, None, message),)
+    return (Finding(TWO_PEOPLE, None, None, message),)
 
 
 def _patches(around: Array, places: Array) -> tuple[Array, Array, Array]:

@@ -24,6 +24,8 @@ UNKNOWN_FLOOR = "floor-unknown"
 """Code of the finding that a bare cloud does not show where the floor is."""
 LOWERED_FLOOR = "floor-lowered"
 """Code of the finding that a person stands below z = 0: cameras or their calibration are off."""
+TWO_PEOPLE = "two-people"
+"""Code of the finding that more than one person was seen."""
 OFF_FLOOR = frozenset({RAISED_FLOOR, LOWERED_FLOOR, UNKNOWN_FLOOR})
 """Codes after which nothing is measured that ends on the floor."""
 
@@ -33,7 +35,7 @@ class Finding:
     """Something that the operator should know of."""
 
     code: str
-    """"motion", "two-people", "camera-blind", "frames-missing", "leaning", "rough", or one of
+    """"motion", "camera-blind", "frames-missing", "leaning", "rough", `TWO_PEOPLE`, or one of
     `OFF_FLOOR`."""
     camera: str | None
     value: float | None

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from station.core.bundle import LEAST_READINGS, NOBODY
 from station.core.errors import InputError
-from workers.cloud.observed import Finding
+from workers.cloud.observed import TWO_PEOPLE, Finding
 from workers.cloud.people import count_people
 
 Array = NDArray[np.float64]
@@ -62,8 +62,8 @@ def one_person(points: Sequence[Array]) -> tuple[list[Mask], list[Finding]]:
     )
     findings = []
     if beside or count_people(everything[np.flatnonzero(keep)[::_PEOPLE_STRIDE]]) > 1:
-        message = "two people (or a large object) in the booth"
-        findings.append(Finding("two-people", None, None, message))
+        message = "two people (or a large object) in the booth; only one person may be there"
+        findings.append(Finding(TWO_PEOPLE, None, None, message))
     ends = np.cumsum([len(part) for part in points])
     return np.split(keep, ends[:-1]), findings
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.cloud.observed import OFF_FLOOR, Finding, PointCloud
+from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
@@ -220,6 +220,9 @@ def judge(
     else:
         reasons += [reason for part, reason in unseen.items() if part not in misplaced]
     reasons += stature if cut else []
+    if any(finding.code == TWO_PEOPLE for finding in findings):
+        # What does not match a body, or does not look like one, comes of it.
+        reasons = [finding.message for finding in findings]
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
