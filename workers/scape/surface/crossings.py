@@ -130,7 +130,10 @@ def _crossing_pairs(corners, lows, highs, faces, tested):  # type: ignore[no-unt
                         entry = start[bucket]
                         triangle[entry] = k
                         columns[entry, 0], columns[entry, 1] = x, y
-                        boxes[entry, :3], boxes[entry, 3:] = lows[k], highs[k]
+                        # Assigning a row takes 4 s to compile.
+                        for axis in range(3):
+                            boxes[entry, axis] = lows[k, axis]
+                            boxes[entry, 3 + axis] = highs[k, axis]
                     else:
                         start[bucket] += 1
         if not filling:

@@ -195,7 +195,10 @@ def _with_data(first, columns, blocks):  # type: ignore[no-untyped-def]  # pragm
         for index in range(first[v], first[v + 1]):
             # The trace: each row adds to it.
             if blocks[index, 0] + blocks[index, 3] + blocks[index, 5] != 0.0:
-                kept[size], filled[size] = columns[index], blocks[index]
+                kept[size] = columns[index]
+                # Assigning a row takes 4 s to compile.
+                for i in range(6):
+                    filled[size, i] = blocks[index, i]
                 size += np.uint32(1)
         starts[v + 1] = size
     return starts, kept[:size].copy(), filled[:size].copy()
