@@ -128,6 +128,13 @@ def test_a_picture_carries_its_order(model: BodyModel) -> None:
         assert picture.info == {"label": "Größe 7 \u7c97", "verdict": "ok"}
 
 
+def test_a_picture_shows_whose_it_is(model: BodyModel) -> None:
+    views, about = views_of(model.mean, model.faces), {"scan_id": "20261127T232543Z-fd9b"}
+    bare, named = (_decoded(preview(views, [], OK, about=texts)) for texts in ({}, about))
+    assert (named[-30:] != BACKGROUND).any()
+    assert np.array_equal(named[:-34], bare[:-34])
+
+
 def test_a_row_that_is_not_measured_is_left_out(model: BodyModel, rows: list[Measurement]) -> None:
     some = [row for row in rows if row.name != "waist_girth"]
     assert len(preview(views_of(model.mean, model.faces), some, OK)) > 1000

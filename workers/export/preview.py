@@ -47,7 +47,7 @@ _SHOWN: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 _BODY_PIXELS = 520
 _BORDER = 26
 _STRIP = 34
-"""Height of the strip below the bodies, for the reasons to scan again."""
+"""Height of the strip below the bodies, for the scan's id and the reasons to scan again."""
 _GAP = 14
 _LINE_GAP = 24
 _SIZE = 15
@@ -95,8 +95,9 @@ def preview(
     """Picture of a body and its measurements as PNG.
 
     Args:
-        about: texts that the PNG carries as iTXt chunks.
+        about: texts that the PNG carries as iTXt chunks; its scan_id is written on the picture.
     """
+    about = about or {}
     by_name = {row.name: replace(row, path=row.path @ views.turn) for row in measurements}
     panels = [
         _panel(frame, rendering, _rows(by_name, left), _rows(by_name, right))
@@ -106,10 +107,14 @@ def preview(
     ]
     picture = np.concatenate(panels, axis=1)
     strip = np.full((_STRIP, picture.shape[1], 3), BACKGROUND, np.uint8)
+    scan_id = about.get("scan_id", "")
+    end = picture.shape[1] - 20 - text_width(scan_id, size=_SIZE)
+    # Pictures of two people lie in one fitting room.
+    write_text(strip, scan_id, (end, 20), size=_SIZE, color=_LEADER)
     if verdict.status != "ok":
-        words = _shortened("scan again: " + "; ".join(verdict.reasons), picture.shape[1] - 40)
+        words = _shortened("scan again: " + "; ".join(verdict.reasons), end - 40)
         write_text(strip, words, (20, 20), size=_SIZE, color=_WARNING)
-    return png(np.concatenate([picture, strip], axis=0), about or {})
+    return png(np.concatenate([picture, strip], axis=0), about)
 
 
 def _rows(by_name: dict[str, Measurement], names: tuple[str, ...]) -> list[Measurement]:
