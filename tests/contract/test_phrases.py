@@ -24,6 +24,7 @@ SPEAKERS = (
     "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
     "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",
+    "station/booth/health.py",
     "station/booth/retention.py", "station/core/spool.py", "station/messaging/transport.py",
     "station/core/depth/intrinsics.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
@@ -218,6 +219,16 @@ def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
 def test_the_page_knows_a_cancelled_scan(tmp_path: Path) -> None:
     scans = [{"state": "failed", "reasons": [why]} for why in (CANCELLED, "the booth is empty")]
     assert _on_the_page(tmp_path, "i18n.js", "outcome", scans, "en") == ["cancelled", "failed"]
+
+
+def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
+    """It knew of a fault of the station and of its disk, and of nothing else."""
+    well = {"running": True, "fault": "", "problems": [], "disk_free_mb": 9, "disk_needed_mb": 1}
+    problems = [SPOKEN[6], "the booth is not calibrated, and takes no scans: run station calibrate"]
+    states = [well, {**well, "problems": problems}, {**well, "running": False}]
+    said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
+    assert said[:2] == [[], [in_language(text, "zh") for text in problems]]
+    assert said[2] == ["扫描站没有响应："]
 
 
 def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:

@@ -7,13 +7,15 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
 
-from station.console.live.control import RefusedError
+from station.console.live import watch as watch_module
+from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
@@ -23,6 +25,7 @@ from station.core.scans import CANCELLED, scan_id_of
 from station.core.spool import Spool
 from station.messaging.messages import CameraHealth
 from station.messaging.transport import publisher
+from station.simulation.scene import default_rig
 
 
 def _until(true: Callable[[], bool]) -> None:
@@ -79,6 +82,42 @@ def test_a_cancelled_scan_does_not_count_as_failed(watch: tuple[Watch, EventLog]
         return booth["failed"], booth["cancelled"]
 
     _until(lambda: counts() == (1, 1))
+
+
+def test_what_status_says_is_said_by_the_console(
+    watch: tuple[Watch, EventLog], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page showed a healthy booth while every scan was refused."""
+    watching, _ = watch
+    assert (watching.booth()["problems"], watching.booth()["can_scan"]) == ([], False)
+
+    def answered(problems: Sequence[str], **sync: Any) -> Callable[..., Any]:
+        processes = {"control": {"age_s": 0.1}}
+        told = {"streaming": True, "processes": processes, "free_bytes": 1e12}
+        return lambda *_: {**told, "sync": {"silent": [], **sync}, "problems": problems}
+
+    def booth() -> tuple[list[str], bool]:
+        told = watching.booth()
+        return told["problems"], told["can_scan"]
+
+    words = "the booth is not calibrated, and takes no scans: run station calibrate"
+    monkeypatch.setattr(watch_module, "command", answered([words]))
+    _until(lambda: booth() == ([words], False))
+    default_rig().save(watching._config.calibration)
+    [camera] = watching._config.cameras
+    cameras = [camera.model_copy(update={"name": name}) for name in default_rig().cameras]
+    config = watching._config.model_copy(update={"cameras": cameras})
+    monkeypatch.setattr(watching, "_config", config)
+    monkeypatch.setattr(watch_module, "command", answered([]))
+    _until(lambda: booth() == ([], True))
+    monkeypatch.setattr(watch_module, "command", answered(["camera a: torn"], silent=["a"]))
+    _until(lambda: booth() == (["camera a: torn"], False))
+
+    def silent(*_: object) -> None:
+        raise NotRunningError("nothing runs")
+
+    monkeypatch.setattr(watch_module, "command", silent)
+    _until(lambda: booth() == ([], False))
 
 
 def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> None:

@@ -70,6 +70,10 @@ class BoothState(BaseModel):
 
     running: bool
     fault: str = Field(description="why no station answers; empty if one does")
+    problems: list[str] = Field(description="what is wrong and what to do, the worst first")
+    can_scan: bool = Field(
+        description="nothing is in the way of a scan, other than sensors that are stopped"
+    )
     streaming: bool
     cameras: list[Camera]
     framesets_hz: float | None

@@ -14,6 +14,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from station.archive.index import ScanIndex
 from station.archive.records import PLACES, ScanRecord
+from station.booth.health import can_scan
 from station.console.live.control import NotRunningError, RefusedError, command
 from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
@@ -95,12 +96,16 @@ class Watch:
 
     def booth(self) -> dict[str, Any]:
         """The booth's state as far as it is known now."""
+        # What was said before the station fell silent may have passed.
+        status = {} if self._fault else self._status
         spool = self._status.get("spool", {})
         failed, cancelled = self._failed
         usage = shutil.disk_usage(self._config.spool.folder)
         return {
             "running": not self._fault,
             "fault": self._fault,
+            "problems": list(status.get("problems", [])),
+            "can_scan": bool(status) and can_scan(self._config, status),
             "streaming": bool(self._status.get("streaming", False)),
             "cameras": [camera.document() for camera in self._cameras.values()],
             "framesets_hz": self._rate_hz,

@@ -5,6 +5,7 @@ import { Cameras } from './cameras.js';
 import { h, notice } from './dom.js';
 import { listen } from './events.js';
 import { said, t, time } from './i18n.js';
+import { troubleBanner } from './troubles.js';
 
 const REFRESH_MS = 5000;
 
@@ -19,7 +20,7 @@ export async function booth(main) {
   const cameras = new Cameras(state.cameras.map((camera) => camera.name));
   const power = h('button', { id: 'power', onclick: () => switchSensors() });
   const facts = h('dl', { className: 'facts' });
-  const banner = h('div', { className: 'banner', role: 'alert', hidden: true });
+  const [banner, showTroubles] = troubleBanner();
   const checkText = h('p', { className: 'small' });
   const checkButton = h('button', { id: 'check', onclick: () => check() }, t('booth.checkNow'));
   const deliveries = h('div', { className: 'card', hidden: true });
@@ -66,11 +67,7 @@ export async function booth(main) {
     ];
     facts.replaceChildren(...rows.flatMap(([name, value]) => [h('dt', {}, name),
       h('dd', { className: value.length > 12 ? 'wide' : '' }, value)]));
-    const fault = !state.running ? t('booth.notRunning', { fault: said(state.fault) })
-      : state.disk_free_mb < 1.5 * state.disk_needed_mb ? t('booth.diskLow') : '';
-    banner.hidden = !fault;
-    banner.className = `banner ${state.running ? 'warn' : 'bad'}`;
-    banner.textContent = fault;
+    showTroubles(state);
     const last = state.last_check;
     checkText.textContent = last === null ? t('booth.never') : `${time(last.time)} – ${checked(last)}`;
     deliveries.hidden = state.waiting_deliveries.length === 0;

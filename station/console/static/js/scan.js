@@ -6,10 +6,12 @@ import { h, notice, s } from './dom.js';
 import { listen } from './events.js';
 import { bodyFigure } from './figure.js';
 import { outcome, said, t, time } from './i18n.js';
+import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
 const POLL_MS = 1000;
+const TROUBLES_MS = 5000;
 
 export async function scan(main, session) {
   const state = await get('/booth');
@@ -17,6 +19,7 @@ export async function scan(main, session) {
   const shown = front.length ? front : state.cameras.slice(0, 2).map((camera) => camera.name);
   const cameras = new Cameras(shown, 'stack mini');
   for (const camera of state.cameras) cameras.state(camera);
+  const [banner, showTroubles] = troubleBanner();
   const presence = h('p', { className: 'soft', role: 'status' });
   cameras.onpresence = (somebody) => { presence.textContent = t(somebody ? 'scan.somebody' : 'scan.nobody'); };
   const stage = h('section', { className: 'card stage', id: 'stage', 'aria-live': 'polite' });
@@ -172,8 +175,13 @@ export async function scan(main, session) {
     } catch { /* told elsewhere */ }
   }
 
+  async function look() {
+    try { showTroubles(await get('/booth')); } catch { /* the connection's loss is told elsewhere */ }
+  }
+
   const silence = listen((kind, data) => {
     if (kind === 'camera') cameras.state(data);
+    if (kind === 'camera' || kind === 'fault') look();
     if (kind === 'framesets' && data.streaming !== streaming) {
       streaming = data.streaming;
       if (!current) ready();
@@ -188,10 +196,13 @@ export async function scan(main, session) {
 
   main.replaceChildren(
     h('div', { className: 'head' }, h('h1', {}, t('scan.title'))),
+    banner,
     h('div', { className: 'scan' }, stage,
       h('aside', { className: 'stack', 'aria-label': t('scan.preview') }, cameras.element, presence,
         h('section', { className: 'card' }, h('h2', {}, t('scan.last')), list))));
+  showTroubles(state);
+  const looking = setInterval(look, TROUBLES_MS);
   ready();
   latest();
-  return () => { clearInterval(timer); silence(); cameras.close(); };
+  return () => { clearInterval(timer); clearInterval(looking); silence(); cameras.close(); };
 }

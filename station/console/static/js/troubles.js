@@ -1,0 +1,28 @@
+// What is wrong with the booth, as `station status` says it.
+
+import { h } from './dom.js';
+import { said, t } from './i18n.js';
+
+// One sentence for each trouble, in the reader's language.
+export function troubles(state) {
+  if (!state.running) return [t('booth.notRunning', { fault: said(state.fault) })];
+  if (state.problems.length) return state.problems.map(said);
+  return state.disk_free_mb < 1.5 * state.disk_needed_mb ? [t('booth.diskLow')] : [];
+}
+
+// A banner and the function that shows in it what is wrong now.
+export function troubleBanner() {
+  const banner = h('div', { className: 'banner', id: 'troubles', role: 'alert', hidden: true });
+  let told = null;
+  function show(state) {
+    const sentences = troubles(state);
+    const now = JSON.stringify([state.can_scan, sentences]);
+    // Written anew only when it changes: a reader of the screen says it each time.
+    if (now === told) return;
+    told = now;
+    banner.hidden = !sentences.length;
+    banner.className = `banner ${state.can_scan ? 'warn' : 'bad'}`;
+    banner.replaceChildren(...sentences.map((sentence) => h('div', {}, sentence)));
+  }
+  return [banner, show];
+}
