@@ -196,7 +196,7 @@ class ControlProcess:
         if request.command == "scan-status":
             return Reply(ok=True, content=self._scan_status(scan_id_of(request.scan_id)))
         if request.command == "status":
-            health = booth_health(self._config)
+            health = booth_health(self._config, self._config_path)
             return Reply(ok=True, content={**asdict(health), "streaming": self._streaming})
         return Reply(ok=False, error=f"control does not know the command {request.command!a:.80}")
 
@@ -320,5 +320,5 @@ def control(config_path: Path | None) -> None:
     path = find_config(config_path)
     config = load_config(path)
     with only_process(config.runtime.folder, "control") as log:
-        serve_metrics(config, log)
+        serve_metrics(config, path.resolve(), log)
         ControlProcess(config, path.resolve(), log).run(stop_event())

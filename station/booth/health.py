@@ -19,6 +19,7 @@ from station.booth.collection import check_words, silence_in_words
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
+from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.rig import Rig
 from station.core.scans import STATES, count_scans
@@ -29,6 +30,10 @@ MAX_AGE_S = 3.0
 """A process reports four times a second; an older report means that it hangs or is gone."""
 _STARTING_S = 15.0
 """Time after the first process has started in which others may be starting still."""
+_CHANGED = (
+    "booth.toml was changed after the booth was started, and is not in use yet: end station run "
+    "and run it again, or for an installed booth: sudo systemctl restart booth.target"
+)
 _STUCK_S = 60.0
 """Time beyond its limit after which a claimed scan counts as stuck."""
 
@@ -50,16 +55,24 @@ class BoothHealth:
     free_bytes: int
     problems: list[str] = field(default_factory=list)
     """Problems with their remedies, the worst first; empty when there are none."""
+    unusable: str = ""
+    """Words on a calibration that the booth that runs takes no scans with; empty if it is sound."""
 
 
-def booth_health(config: BoothConfig) -> BoothHealth:
-    """The booth as it is now; what cannot be read is a problem of its own."""
+def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
+    """The booth as it is now; what cannot be read is a problem of its own.
+
+    Args:
+        path: the booth.toml that `config` was read from, if the booth that runs goes by `config`.
+    """
     folder = config.runtime.folder
     processes = {service.name: read_health(folder, service.name) for service in services(config)}
     if not any(map(_lives, processes.values())):
         # Reports of a booth that was stopped a moment ago are as fresh as those of one that runs.
         processes = {name: {} for name in processes}
-    problems = _silent(processes)
+    # Else a remedy that changes booth.toml would seem not to help.
+    problems = [_CHANGED] if path is not None and _changed(path, config) else []
+    problems += _silent(processes)
     sync = processes["sync"]
     if not reports(sync):
         sync = {"error": "the sync process is not reporting on cameras and framesets"}
@@ -78,7 +91,7 @@ def booth_health(config: BoothConfig) -> BoothHealth:
         problems.append(words)
     problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
-    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems)
+    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems, words)
 
 
 def _lives(content: Mapping[str, Any]) -> bool:
@@ -116,7 +129,9 @@ def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
     troubled = any(camera["trouble"] for camera in sync.get("cameras", {}).values())
     # A booth that has never run has no spool yet.
     full = config.spool.folder.is_dir() and _is_full(config, status["free_bytes"])
-    disturbed = silent or troubled or full or sync.get("problems") or unusable(config)
+    # booth.toml may have been edited since the booth was started.
+    unfit = status.get("unusable") or unusable(config)
+    disturbed = silent or troubled or full or sync.get("problems") or unfit
     return all(map(reports, status["processes"].values())) and not disturbed
 
 
@@ -140,6 +155,21 @@ def _calibrated(path: Path, version: tuple[int, int, int]) -> dict[str, str]:  #
     Asked for every second, and read only when the file is another version of it.
     """
     return calibrated_serials(Rig.load(path).cameras)
+
+
+def _changed(path: Path, config: BoothConfig) -> bool:
+    """Whether a booth.toml says something else than the booth that runs goes by."""
+    try:
+        file = path.stat()
+        return _read(path, (file.st_ino, file.st_mtime_ns, file.st_size)) != config
+    except (BoothError, OSError):
+        return True
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, version: tuple[int, int, int]) -> BoothConfig:  # noqa: ARG001
+    """A booth.toml, read only when the file is another version of it."""
+    return load_config(path)
 
 
 def _silent(processes: dict[str, dict[str, Any]]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -18,11 +19,11 @@ _LOCAL = "127.0.0.1"
 class BoothCollector(Collector):
     """Reads the booth's state whenever metrics are requested."""
 
-    def __init__(self, config: BoothConfig) -> None:
-        self._config = config
+    def __init__(self, config: BoothConfig, path: Path) -> None:
+        self._config, self._path = config, path
 
     def collect(self) -> Iterator[Metric]:
-        health = booth_health(self._config)
+        health = booth_health(self._config, self._path)
         yield from _processes(health)
         yield from _cameras(health)
         yield from _spool(health)
@@ -81,12 +82,12 @@ def _spool(health: BoothHealth) -> Iterator[Metric]:
     )
 
 
-def serve_metrics(config: BoothConfig, log: logging.Logger) -> None:
+def serve_metrics(config: BoothConfig, path: Path, log: logging.Logger) -> None:
     """Serve the metrics on this machine, if a port is configured."""
     if not config.metrics.port:
         return
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(BoothCollector(config))
+    registry.register(BoothCollector(config, path))
     try:
         start_http_server(config.metrics.port, addr=_LOCAL, registry=registry)
     except OSError as error:

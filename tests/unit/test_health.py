@@ -218,6 +218,28 @@ def test_status_tells_once_that_the_calibration_is_of_other_cameras(
         assert shown(told).count("! camera b was calibrated and is not in booth.toml") == 1
 
 
+def test_a_booth_that_goes_by_another_booth_toml_says_so(config: BoothConfig) -> None:
+    """To put booth.toml back, as it was told to, did not help, and nothing said why."""
+    path = config.runtime.folder.parent / "booth.toml"
+    text = path.read_text()
+    path.write_text(text.replace('name = "b"', 'name = "c"'))
+    wrong = load_config(path)
+    _problems(wrong, streaming=True, silent=[], cameras={})
+    _tell(wrong, "capture c")
+    [problem] = booth_health(wrong, path).problems
+    assert problem.startswith("camera b was calibrated and is not in booth.toml")
+    path.write_text(text)
+    health = booth_health(wrong, path)
+    assert health.problems[0].startswith("booth.toml was changed after the booth was started")
+    assert health.problems[1] == problem
+    assert not can_scan(config, {**asdict(health), "streaming": True})
+    path.write_text(f"# A remark changes nothing.\n{text}")
+    assert booth_health(config, path).problems == []
+    path.unlink()
+    [problem] = booth_health(config, path).problems
+    assert "was changed" in problem
+
+
 @pytest.mark.parametrize(
     "sync",
     [
