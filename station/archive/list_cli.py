@@ -10,10 +10,11 @@ from pathlib import Path
 import click
 
 from station.archive.index import ScanIndex
-from station.archive.records import ScanRecord
+from station.archive.records import ScanRecord, read_noted
 from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
 from station.core.files import local_time
+from station.core.scans import ScanId, is_scan_id
 from station.core.spool import Spool
 
 _limit_option = click.option(
@@ -48,8 +49,8 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
     """List the scans of this booth, newest first, with their outcome.
 
     Scans that were not taken (nobody in the booth, a silent camera) are not listed: of them there
-    is nothing but the reason that was told. Times are the booth's local time; those in scan ids and
-    in JSON are UTC.
+    is nothing but the reason, which station find tells by the whole scan id. Times are
+    the booth's local time; those in scan ids and in JSON are UTC.
 
     \b
     Examples:
@@ -68,25 +69,38 @@ def list_scans(config_path: Path | None, since: str, limit: int, as_json: bool) 
 def find(text: str, config_path: Path | None, limit: int, as_json: bool) -> None:
     """Find scans whose label or id contains TEXT, ignoring case.
 
+    By its whole id also a scan is found that was not taken, with the reason.
+
     \b
     Examples:
       station find "Order 1234"
       station find 20261121
+      station find 20261121T100000Z-7f3a
     """
     _show(config_path, text, "", limit, as_json)
 
 
 def _show(config_path: Path | None, text: str, since: str, limit: int, as_json: bool) -> None:
     config = load_config(find_config(config_path))
-    found = ScanIndex(Spool(config.spool.folder)).find(text, since=since, limit=limit)
+    spool = Spool(config.spool.folder)
+    found = ScanIndex(spool).find(text, since=since, limit=limit)
+    if not found and is_scan_id(text) and (noted := read_noted(spool, ScanId(text))):
+        found = [noted]
     if as_json:
         click.echo(json.dumps([{**asdict(scan), "verdict": scan.verdict} for scan in found]))
         return
     if not found:
         since_then = f"no scans since {local_time(since)}" if since else "no scans yet"
-        click.echo(f"no scan matches {text!r}" if text else since_then)
+        click.echo((_unended(spool, text) or f"no scan matches {text!r}") if text else since_then)
     for scan in found:
         click.echo(_line(scan))
+
+
+def _unended(spool: Spool, text: str) -> str:
+    """Words on a scan that is being taken, or was when the booth ended; empty if there is none."""
+    if not is_scan_id(text) or spool.notes.read(ScanId(text)) is None:
+        return ""
+    return f"scan {text} has no outcome yet; it has one soon if the booth runs: see station status"
 
 
 def _moment(given: str) -> str:

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from station.core.scans import CANCELLED, REASON
+from station.core.scans import CANCELLED, REASON, ScanId
 from station.core.spool import Spool
 
 ScanState = Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]
@@ -78,6 +78,32 @@ def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
         finished=changed if place in ("outbox", "failed") else "",
         reasons=reasons,
         seconds=seconds,
+    )
+
+
+def read_noted(spool: Spool, scan_id: ScanId) -> ScanRecord | None:
+    """A scan that has ended and of which the spool has nothing but the note.
+
+    It was refused or interrupted before it had a bundle, or its result was taken away.
+    """
+    note = spool.notes.read(scan_id)
+    if note is None or note.stage not in ("failed", "delivered"):
+        return None
+    try:
+        changed = _moment(spool.notes.path(scan_id).stat().st_mtime)
+    except OSError:
+        return None
+    state: ScanState = "failed" if note.stage == "failed" else "delivered"
+    if note.verdict == "rescan":
+        state = "rescan"
+    return ScanRecord(
+        scan_id=scan_id,
+        state=state,
+        label=note.label,
+        booth="",
+        created=moment_of(scan_id) or changed,
+        finished=changed,
+        reasons=(note.reason,) if note.reason else (),
     )
 
 

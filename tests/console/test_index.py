@@ -8,6 +8,8 @@ import sqlite3
 import threading
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -16,8 +18,11 @@ from station.archive.index import FILE, IndexBusyError, ScanIndex
 from station.archive.records import ScanRecord
 from station.booth.retention import purge
 from station.cli import station
+from station.console.api.problems import ProblemError
+from station.console.api.scans import _state
+from station.core.config_file import load_config
 from station.core.files import write_json
-from station.core.scans import CANCELLED, REASON
+from station.core.scans import CANCELLED, REASON, ScanId, ScanNote
 from station.core.spool import Spool
 
 
@@ -187,6 +192,40 @@ def test_list_and_find_on_the_command_line(spool: Spool) -> None:
     found = CliRunner().invoke(station, ["find", "order 1234", "--json", *option])
     assert [scan["scan_id"] for scan in json.loads(found.output)] == ["20261121T100000Z-0001"]
     assert "no scan matches 'x'" in CliRunner().invoke(station, ["find", "x", *option]).output
+
+
+def test_a_scan_that_was_never_stored_is_found_by_its_id(spool: Spool) -> None:
+    """The operator was told to look for an interrupted scan, and nothing matched."""
+    option = _booth(spool)
+    scan_id = ScanId("20261125T100000Z-7f3a")
+    note = ScanNote(scan_id, "failed", label="Order 8", reason="the booth was stopped")
+    spool.notes.write(note, durable=False)
+    shown = CliRunner().invoke(station, ["find", scan_id, *option]).output
+    assert shown.startswith(scan_id)
+    assert shown.endswith("failed         Order 8  the booth was stopped\n")
+    told = CliRunner().invoke(station, ["find", scan_id, "--json", *option]).output
+    assert json.loads(told)[0]["created"] == "2026-11-25T10:00:00Z"
+    assert scan_id not in CliRunner().invoke(station, ["list", *option]).output
+    spool.notes.write(ScanNote(scan_id, "delivered", verdict="rescan"), durable=False)
+    assert "scan again" in CliRunner().invoke(station, ["find", scan_id, *option]).output
+    spool.notes.write(ScanNote(scan_id, "capturing"), durable=False)
+    assert "has no outcome yet" in CliRunner().invoke(station, ["find", scan_id, *option]).output
+
+
+def test_the_api_tells_of_a_scan_that_was_never_stored_without_a_station(spool: Spool) -> None:
+    """It was said not to exist."""
+    _booth(spool)
+    config = load_config(spool.folder.parent / "booth.toml")
+    waiting = SimpleNamespace(status=lambda _: None)
+    told: Any = SimpleNamespace(
+        spool=spool, index=ScanIndex(spool), countdown=waiting, config=config
+    )
+    scan_id = ScanId("20261125T100000Z-7f3a")
+    with pytest.raises(ProblemError, match="there is no scan"):
+        _state(told, scan_id)
+    spool.notes.write(ScanNote(scan_id, "failed", reason="the booth was stopped"), durable=False)
+    scan = _state(told, scan_id)
+    assert (scan.state, scan.reasons) == ("failed", ["the booth was stopped"])
 
 
 def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:

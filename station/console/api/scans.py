@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 
-from station.archive.records import ScanRecord, ScanState
+from station.archive.records import ScanRecord, ScanState, read_noted
 from station.booth.retention import purge_scan
 from station.console.api.console import (
     Booth,
@@ -24,7 +24,7 @@ from station.console.api.console import (
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, RefusedError, command
-from station.core.scans import boot_id, new_scan_id
+from station.core.scans import boot_id, new_scan_id, scan_id_of
 from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
@@ -116,7 +116,10 @@ def _state(console: Console, scan_id: str) -> Scan:
     except RefusedError as error:
         raise ProblemError(404, "no-such-scan", str(error)) from None
     except NotRunningError:
-        raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
+        noted = read_noted(console.spool, scan_id_of(scan_id))
+        if noted is None:
+            raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
+        return of_record(noted)
     if found.state not in _ON_DISK:
         return found
     # On disk by now, or deleted: the folders take precedence over the station's memory.
