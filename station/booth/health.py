@@ -22,7 +22,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.rig import Rig
-from station.core.scans import STATES, count_scans
+from station.core.scans import CANCELLED, STATES, count_scans, failure_reason
 from station.core.service import NOTHING_RUNS, read_health
 from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
@@ -48,7 +48,7 @@ class BoothHealth:
     sync: dict[str, Any]
     """Cameras, framesets and latencies; {"error"} while sync does not report."""
     spool: dict[str, int]
-    """Scans in each folder."""
+    """Scans in each folder; failed/ has the cancelled ones, too."""
     oldest_waiting_s: float
     stuck: list[str]
     """Claimed scans that should have ended."""
@@ -57,6 +57,8 @@ class BoothHealth:
     """Problems with their remedies, the worst first; empty when there are none."""
     unusable: str = ""
     """Words on a calibration that the booth that runs takes no scans with; empty if it is sound."""
+    cancelled: int = 0
+    """Scans in failed/ that the operator cancelled."""
 
 
 def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
@@ -91,7 +93,15 @@ def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
         problems.append(words)
     problems += problem_in_words(config)
     spool, oldest_s, stuck, free = _disk(config, problems)
-    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems, words)
+    cancelled = _cancelled(config.spool.folder / "failed", spool.get("failed", 0))
+    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems, words, cancelled)
+
+
+def scans_by_outcome(spool: Mapping[str, int], cancelled: int) -> dict[str, int]:
+    """Scans in each folder of the spool, the cancelled ones apart from those that failed."""
+    failed = spool.get("failed", 0) - cancelled
+    counts = {**spool, "failed": failed, "cancelled": cancelled}
+    return {name: count for name, count in counts.items() if count > 0}
 
 
 def _lives(content: Mapping[str, Any]) -> bool:
@@ -213,6 +223,20 @@ def _cameras(
         remedy = check_words(list(silent), recorded)
         problems.append(f"{silence_in_words(silent)}; {remedy}")
     return problems
+
+
+def _cancelled(failed: Path, count: int) -> int:
+    """Number of scans in failed/ that the operator cancelled."""
+    try:
+        return _count_cancelled(failed, failed.stat().st_mtime_ns, count) if count else 0
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=1)
+def _count_cancelled(failed: Path, changed_ns: int, count: int) -> int:  # noqa: ARG001
+    """As `_cancelled`; asked for every second, and counted only when the folder has changed."""
+    return sum(failure_reason(folder) == CANCELLED for folder in failed.iterdir())
 
 
 def _is_full(config: BoothConfig, free_bytes: int) -> bool:

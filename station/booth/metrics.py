@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from station.booth.health import BoothHealth, booth_health
+from station.booth.health import BoothHealth, booth_health, scans_by_outcome
 from station.core.config import BoothConfig
 
 _LOCAL = "127.0.0.1"
@@ -66,8 +66,8 @@ def _cameras(health: BoothHealth) -> Iterator[Metric]:
 
 
 def _spool(health: BoothHealth) -> Iterator[Metric]:
-    scans = GaugeMetricFamily("booth_scans", "scans in a folder of the spool", labels=["state"])
-    for state, count in health.spool.items():
+    scans = GaugeMetricFamily("booth_scans", "scans in the spool", labels=["state"])
+    for state, count in scans_by_outcome(health.spool, health.cancelled).items():
         scans.add_metric([state], count)
     yield scans
     yield GaugeMetricFamily(

@@ -14,7 +14,14 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import booth_health, can_scan, reports, starting, unusable
+from station.booth.health import (
+    booth_health,
+    can_scan,
+    reports,
+    scans_by_outcome,
+    starting,
+    unusable,
+)
 from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -202,7 +209,7 @@ def _show_status(content: Mapping[str, Any]) -> None:
         )
     for name, count in content["processes"].get("deliver", {}).get("waiting", {}).items():
         click.echo(f"deliver {name}: " + (f"{count} to hand over" if count else "all handed over"))
-    counts = content["spool"]
+    counts = scans_by_outcome(content["spool"], content.get("cancelled", 0))
     free = f"; {content['free_bytes'] / 1e9:.1f} GB free" if content["free_bytes"] else ""
     click.echo(
         f"spool: {', '.join(f'{n} {state}' for state, n in counts.items()) or 'empty'}{free}"

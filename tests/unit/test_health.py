@@ -17,13 +17,16 @@ from click.testing import CliRunner
 
 from station.booth import operator_cli
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
+from station.booth.metrics import BoothCollector
 from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
 from station.core.rig import Rig
+from station.core.scans import CANCELLED, scan_id_of
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
+from station.core.spool import Spool
 from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
 from station.sensors.identity import calibrated_serials
@@ -310,6 +313,24 @@ def test_a_silent_process_is_in_the_way_of_scans(config: BoothConfig) -> None:
     assert can_scan(config, {**asdict(booth_health(config)), "streaming": True})
     _tell(config, "capture a", age_s=5.0)
     assert not can_scan(config, {**asdict(booth_health(config)), "streaming": True})
+
+
+def test_cancelled_scans_are_not_said_to_have_failed(config: BoothConfig) -> None:
+    """Status and the metrics counted them as failures, and the page did not."""
+    spool = Spool(config.spool.folder)
+    path = config.runtime.folder.parent / "booth.toml"
+    for scan_id in ("a", "b", "c"):
+        bundle = spool.temporary(scan_id)
+        bundle.mkdir()
+        spool.submit(bundle, scan_id)
+        assert spool.withdraw(scan_id_of(scan_id), "torn" if scan_id == "c" else CANCELLED)
+    shown = CliRunner().invoke(operator_cli.status, ["--config", str(path)]).output
+    assert "spool: 1 failed, 2 cancelled;" in shown
+    [scans] = [m for m in BoothCollector(config, path).collect() if m.name == "booth_scans"]
+    assert {s.labels["state"]: s.value for s in scans.samples} == {"failed": 1, "cancelled": 2}
+    spool.retry(scan_id_of("c"))
+    assert booth_health(config).spool == {"queue": 1, "failed": 2}
+    assert booth_health(config).cancelled == 2
 
 
 def test_control_answered_if_it_says_whether_the_sensors_run() -> None:
