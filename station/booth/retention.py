@@ -166,7 +166,7 @@ def _names(name: str, scan_id: ScanId) -> bool:
 
 
 def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
-    """Delete a scan: its bundle, its results, its note and its name.
+    """Delete a scan: its bundle, its results, its note and its name. Returns what was removed.
 
     Raises:
         InputError: it is not a valid scan id.
@@ -199,7 +199,7 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
     finally:
         if lock is not None:
             spool.unlock(name, lock)
-    return [path for path in found if path.parent.name in STATES]
+    return found
 
 
 @click.command()
@@ -229,7 +229,7 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         removed = _purge_label(spool, str(label))
     for folder in removed:
         click.echo(f"removed {folder}")
-    if not removed:
+    if old and not removed:
         click.echo("nothing is past its retention period")
     # Labels leave the index together with the scans, not at the next query.
     ScanIndex(spool).find(limit=0)

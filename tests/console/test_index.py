@@ -300,6 +300,17 @@ def test_purge_by_label(spool: Spool) -> None:
     assert CliRunner().invoke(purge, ["x", "--old", *option]).exit_code == 2
 
 
+def test_what_is_removed_of_a_scan_that_was_never_stored_is_told(spool: Spool) -> None:
+    """It was said that nothing was past its retention period."""
+    option = _booth(spool)
+    scan_id = ScanId("20261125T100000Z-7f3a")
+    spool.notes.write(ScanNote(scan_id, "failed", reason="the booth was stopped"), durable=False)
+    done = CliRunner().invoke(purge, [scan_id, *option])
+    assert done.output == f"removed {spool.notes.path(scan_id)}\n"
+    assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
+    assert "nothing is past" in CliRunner().invoke(purge, ["--old", *option]).output
+
+
 def test_a_waiting_scan_is_withdrawn_once(spool: Spool) -> None:
     assert spool.withdraw("20261120T100000Z-0000", "cancelled")
     assert not spool.withdraw("20261120T100000Z-0000", "cancelled")
