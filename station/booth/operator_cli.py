@@ -232,9 +232,9 @@ def _show_status(content: Mapping[str, Any]) -> None:
 def scan(
     config_path: Path | None, label: str, scan_id: str | None, wait: bool, timeout_s: float
 ) -> None:
-    """Scan the person in the booth and wait for the result.
+    """Scan the person in the booth and wait for the result, which is usable or to be scanned again.
 
-    Exit code 0: delivered; 3: delivered, but scan again; 1: failed.
+    Exit code 0: delivered and usable; 3: delivered, but scan again; 1: failed.
 
     \b
     Examples:
@@ -265,6 +265,8 @@ def scan(
     if again:
         # Before any number, which nobody should then take down.
         click.echo(f"scan again: {session['reason']}", err=True)
+    else:
+        click.echo("verdict: usable")
     took = f"{time.monotonic() - began_s:.1f} s from the command to the result"
     path = session["path"]
     if not path or not Path(path).is_dir():

@@ -196,6 +196,29 @@ def test_a_scan_that_was_accepted_outlives_the_station(
     assert "outcome not known yet" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("state", "reason", "words", "code"),
+    [
+        ("delivered", "", "verdict: usable", 0),
+        ("rescan", "stand upright", "scan again: stand upright", 3),
+    ],
+)
+def test_the_verdict_is_told_whatever_it_is(
+    one_camera: BoothConfig,
+    monkeypatch: pytest.MonkeyPatch,
+    state: str,
+    reason: str,
+    words: str,
+    code: int,
+) -> None:
+    """A good one was to be guessed from the lack of words."""
+    session = {"state": state, "reason": reason, "wanted": 0, "framesets": 0, "path": ""}
+    monkeypatch.setattr(operator_cli, "_ask_until_answered", lambda *_: session)
+    done = _run(scan, one_camera)
+    assert words in done.output.splitlines()
+    assert done.exit_code == code
+
+
 def test_a_cancelled_scan_is_not_said_to_have_failed(
     one_camera: BoothConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
