@@ -34,6 +34,8 @@ _CHANGED = (
     "booth.toml was changed after the booth was started, and is not in use yet: end station run "
     "and run it again, or for an installed booth: sudo systemctl restart booth.target"
 )
+_BESIDE_SCANS = ("console", "deliver")
+"""Processes without which scans are taken and reconstructed all the same."""
 _STUCK_S = 60.0
 """Time beyond its limit after which a claimed scan counts as stuck."""
 
@@ -142,7 +144,8 @@ def can_scan(config: BoothConfig, status: Mapping[str, Any]) -> bool:
     # booth.toml may have been edited since the booth was started.
     unfit = status.get("unusable") or unusable(config)
     disturbed = silent or troubled or full or sync.get("problems") or unfit
-    return all(map(reports, status["processes"].values())) and not disturbed
+    needed = [told for name, told in status["processes"].items() if name not in _BESIDE_SCANS]
+    return all(map(reports, needed)) and not disturbed
 
 
 def unusable(config: BoothConfig) -> str:

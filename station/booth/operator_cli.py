@@ -36,6 +36,7 @@ from station.messaging.transport import NoAnswerError, NothingRunsError, ask, as
 _POLL_S = 0.05
 _BEGINS_S = 3.0
 """Time within which `station run` shows that it runs, on a busy computer."""
+_STARTS = "the booth is starting; try again in a few seconds"
 _EXIT_RESCAN = 3
 _EXIT_NO_SCANS = 1
 _UNSURE_S = 15.0
@@ -151,8 +152,9 @@ def status(config_path: Path | None, as_json: bool) -> None:
     """Show processes, cameras, framesets and the spool, and what is wrong with them.
 
     Exit code 0: scans can be taken, once the sensors are started if they are stopped; 1: they
-    cannot, because the booth does not run, a process or a camera is silent or disturbed, the disk
-    is full, or the calibration is missing or of other cameras. What is known is shown either way.
+    cannot, because the booth does not run, a process that scans need or a camera is silent or
+    disturbed, the disk is full, or the calibration is missing or of other cameras. What is known is
+    shown either way.
 
     \b
     Examples:
@@ -166,7 +168,7 @@ def status(config_path: Path | None, as_json: bool) -> None:
     except BoothError as problem:
         error, content = problem, {**asdict(booth_health(config)), "streaming": None}
         if starting(content["processes"]):
-            error = BoothError("the booth is starting; try again in a few seconds")
+            error = BoothError(_STARTS)
     if as_json:
         click.echo(json.dumps(content))
     else:
@@ -178,6 +180,8 @@ def status(config_path: Path | None, as_json: bool) -> None:
         words = unusable(config)
         if not as_json and words and words not in content["problems"]:
             click.echo(f"! {words}")
+        if not as_json and starting(content["processes"]):
+            click.echo(f"! {_STARTS}")
         sys.exit(_EXIT_NO_SCANS)
 
 

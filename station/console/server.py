@@ -27,6 +27,8 @@ _MAX_CONNECTIONS = 200
 _MAX_OF_ONE_ADDRESS = 64
 """A tablet opens less than ten; whoever opens more keeps nobody else out."""
 _STOP_S = 2
+_TRY_S = 1.0
+"""Period of trying to listen. A third of the time after which a process counts as silent."""
 _SEND_BYTES = 128 << 10
 """Two of the four cameras' pictures. The kernel's own choice, 4 MB, is ten seconds of them, drawn
 for a viewer that reads nothing."""
@@ -126,14 +128,12 @@ def is_loopback(host: str) -> bool:
 
 
 def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
-    """Serve until told to stop.
-
-    Raises:
-        BoothError: the address cannot be listened at.
-    """
+    """Serve until told to stop."""
     config = console.config.console
     secure = check_exposure(config, console.vault.has_password)
-    listener = _listener(config.host, config.port)
+    listener = _awaited_listener(console, log, stop)
+    if listener is None:
+        return
     server = uvicorn.Server(
         uvicorn.Config(
             create_app(console),
@@ -166,6 +166,29 @@ def _until(stop: threading.Event, server: uvicorn.Server, console: Console) -> N
     server.should_exit = True
 
 
+def _awaited_listener(
+    console: Console, log: logging.Logger, stop: threading.Event
+) -> socket.socket | None:
+    """The socket to serve at, as soon as it can be had; None if told to stop before.
+
+    A process that ended for it could tell nobody the reason but its log.
+    """
+    config, told = console.config.console, ""
+    while not stop.is_set():
+        try:
+            return _listener(config.host, config.port)
+        except BoothError as error:
+            if not told:
+                console.heart.ready()
+            if str(error) != told:
+                told = str(error)
+                log.error("%s", told)
+            console.heart.beat()
+            console.heart.report({"problems": [told]})
+        stop.wait(_TRY_S)
+    return None
+
+
 def _listener(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
@@ -173,11 +196,11 @@ def _listener(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)
     try:
         listener.bind((host, port))
+        listener.listen(128)
     except OSError as cause:
         listener.close()
         raise BoothError(
-            f"the console cannot listen at {host}:{port} ({cause.strerror}); choose another "
-            "console.port in booth.toml"
+            f"the console cannot listen at {host}:{port} ({cause.strerror}); end the program that "
+            "uses this port, or choose another console.port in booth.toml and restart the booth"
         ) from None
-    listener.listen(128)
     return listener

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import socket
 import ssl
+import threading
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,18 +20,52 @@ import websockets
 from click.testing import CliRunner
 from live_console import API, PASSWORD, LiveConsole
 
+from station.console.api.console import Console
 from station.console.security.certificate import make_certificate
 from station.console.security.origin import host_allowed, own_names, same_origin
 from station.console.security.throttle import FREE_TRIES, LoginThrottle, pause_s
 from station.console.security.vault import Vault
-from station.console.server import check_exposure
+from station.console.server import _awaited_listener, check_exposure
 from station.core.config import ConsoleConfig
+from station.core.config_file import load_config
 from station.core.errors import BoothError, ConfigError
+from station.core.service import read_health
 
 
 @pytest.fixture
 def vault(tmp_path: Path) -> Vault:
     return Vault(tmp_path / "console")
+
+
+def test_a_console_whose_port_is_taken_says_so_and_waits(tmp_path: Path) -> None:
+    """It ended again and again, and status did not say why."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        path = tmp_path / "booth.toml"
+        path.write_text(
+            '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+            f"[console]\nport = {port}\n"
+        )
+        console = Console(load_config(path), path, logging.getLogger())
+        stop = threading.Event()
+        got: list[socket.socket | None] = []
+        waiting = threading.Thread(
+            target=lambda: got.append(_awaited_listener(console, console.log, stop))
+        )
+        waiting.start()
+        while not (told := read_health(console.config.runtime.folder, "console")):
+            time.sleep(0.05)
+        assert told["problems"][0].startswith(f"the console cannot listen at 127.0.0.1:{port} (")
+    waiting.join(60.0)
+    [listener] = got
+    assert listener is not None
+    listener.close()
+    stop.set()
+    assert _awaited_listener(console, console.log, stop) is None
+    console.vault.close()
+    console.audit.close()
 
 
 def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:

@@ -202,6 +202,23 @@ def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
     assert code(streaming=True) == 1
 
 
+def test_status_says_that_a_process_that_scans_need_is_starting(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ended with 1, and without a reason."""
+    now_s = time.monotonic()
+    for process in ("capture a", "workers", "control"):
+        _tell(config, process, started_s=now_s - 1.0)
+    _tell(config, "sync", started_s=now_s - 1.0, silent=["b"], cameras={"b": _camera("off")})
+    told = {**asdict(booth_health(config)), "streaming": False}
+    monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
+    path = str(config.runtime.folder.parent / "booth.toml")
+    monkeypatch.setattr(operator_cli, "_show_status", lambda _: None)
+    done = CliRunner().invoke(operator_cli.status, ["--config", path])
+    assert done.exit_code == 1
+    assert done.output == "! the booth is starting; try again in a few seconds\n"
+
+
 def test_status_tells_once_that_the_calibration_is_of_other_cameras(
     config: BoothConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -331,6 +348,16 @@ def test_cancelled_scans_are_not_said_to_have_failed(config: BoothConfig) -> Non
     spool.retry(scan_id_of("c"))
     assert booth_health(config).spool == {"queue": 1, "failed": 2}
     assert booth_health(config).cancelled == 2
+
+
+def test_a_console_that_only_starts_is_not_in_the_way_of_scans(config: BoothConfig) -> None:
+    """Status ended with 1 for it, and said nothing."""
+    shown = config.console.model_copy(update={"enabled": True})
+    config = config.model_copy(update={"console": shown})
+    assert _problems(config, streaming=True, silent=[], cameras={})
+    health = booth_health(config)
+    assert health.processes["console"] == {}
+    assert can_scan(config, {**asdict(health), "streaming": True})
 
 
 def test_control_answered_if_it_says_whether_the_sensors_run() -> None:
