@@ -37,12 +37,14 @@ _POLL_S = 0.05
 _BEGINS_S = 3.0
 """Time within which `station run` shows that it runs, on a busy computer."""
 _STARTS = "the booth is starting; try again in a few seconds"
+_NOT_BEGUN = f"{_STARTS}; no scan was started"
 _EXIT_RESCAN = 3
 _EXIT_NO_SCANS = 1
 _UNSURE_S = 15.0
 """Time within which a process that hangs is restarted and the outcome of a scan is known again."""
 _TIMEOUT = Number(0.0, 86400.0, unit="seconds")
-_LOCKS = (STATION_LOCK, "control.lock", "sync.lock")
+_CONTROL_LOCK = "control.lock"
+_LOCKS = (STATION_LOCK, _CONTROL_LOCK, "sync.lock")
 _WORDS = {
     "armed": "waiting for the cameras",
     "capturing": "hold still",
@@ -378,11 +380,15 @@ def _ask_until_answered(
 
     Raises:
         UnsureError: it did not arrive; the scan may be taken anyway.
-        BoothError: control refused; no scan was started.
+        BoothError: control refused, or never ran; no scan was started.
     """
     deadline_s = time.monotonic() + _UNSURE_S
-    told = False
+    lock = config.runtime.folder / _CONTROL_LOCK
+    received = line is not None
+    told = ""
     while True:
+        # An order that nobody could receive is not taken up later: it went with its socket.
+        received = received or is_held(lock)
         try:
             return _command(config, request)
         except NoAnswerError:
@@ -390,13 +396,17 @@ def _ask_until_answered(
             if not (told or line or runs):
                 # No station is running here: nobody received the order.
                 raise
+            received = received or is_held(lock)
             if time.monotonic() > deadline_s:
-                raise UnsureError(request.scan_id) from None
-            if not told:
+                raise (
+                    UnsureError(request.scan_id) if received else BoothError(_NOT_BEGUN)
+                ) from None
+            words = UNSURE if received else "the booth is starting"
+            if told != words:
                 if line is not None:
                     line.close()
-                click.echo(f"  {UNSURE}", err=True)
-            told = True
+                click.echo(f"  {words}", err=True)
+            told = words
             time.sleep(_POLL_S)
 
 

@@ -24,7 +24,7 @@ from station.core.files import held
 from station.core.scans import CANCELLED
 from station.core.service import HEALTH, STATION_LOCK
 from station.messaging.messages import Reply, Request
-from station.messaging.transport import NothingRunsError
+from station.messaging.transport import NoAnswerError, NothingRunsError
 
 
 def _row(name: str, value_m: float | None, half_m: float = 0.008, basis: str = "seen") -> Any:
@@ -217,6 +217,44 @@ def test_the_verdict_is_told_whatever_it_is(
     done = _run(scan, one_camera)
     assert words in done.output.splitlines()
     assert done.exit_code == code
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_scan_of_a_booth_that_is_starting_is_not_said_to_be_unsure(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch, *, answers: bool
+) -> None:
+    """Nobody had received it: it was refused a moment later."""
+    replies: Iterator[Reply] = iter([Reply(ok=False, error="the sensors are stopped")])
+    asked: list[object] = []
+
+    def ask(*words: object) -> Reply:
+        asked.append(words)
+        if len(asked) < 3 or not answers:
+            raise NoAnswerError("control did not answer")
+        return next(replies)
+
+    monkeypatch.setattr(operator_cli, "ask", ask)
+    monkeypatch.setattr(operator_cli, "_UNSURE_S", 60.0 if answers else 0.0)
+    with held(one_camera.runtime.folder / STATION_LOCK, BoothError("held")):
+        done = _run(scan, one_camera)
+    if answers:
+        assert str(done.exception) == "the sensors are stopped"
+        assert done.output == "  the booth is starting\n"
+    else:
+        assert str(done.exception).endswith("no scan was started")
+
+
+def test_a_scan_that_control_may_have_received_is_said_to_be_unsure(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ask(*_: object) -> Reply:
+        raise NoAnswerError("control did not answer")
+
+    monkeypatch.setattr(operator_cli, "ask", ask)
+    monkeypatch.setattr(operator_cli, "_UNSURE_S", 0.0)
+    with held(one_camera.runtime.folder / "control.lock", BoothError("held")):
+        done = _run(scan, one_camera)
+    assert isinstance(done.exception, operator_cli.UnsureError)
 
 
 def test_a_cancelled_scan_is_not_said_to_have_failed(
