@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Generic, TypeVar
@@ -13,6 +13,8 @@ Frame = TypeVar("Frame")
 _LONGEST_QUEUE = 20
 """Two thirds of a second: frames of one camera may come half a second after those of the others."""
 
+_RECENT_S = 2.0
+"""Framesets that come more rarely are too few for any scan."""
 _SURE_SHARE = 0.6
 """Share of the tolerance, which is three quarters of a period at most: a set that is tighter than
 half a period cannot be made tighter by the earliest camera's next frame, so it need not wait."""
@@ -91,3 +93,11 @@ class FramesetMatcher(Generic[Frame]):
     def _take(self, heads: dict[str, float], spread: float) -> Frameset[Frame]:
         frames = {name: queue.popleft()[1] for name, queue in self._queues.items()}
         return Frameset(frames, max(heads.values()), spread)
+
+
+def rate_hz(times_s: Sequence[float], now_s: float) -> float:
+    """Rate of framesets from the moments of the last ones, oldest first; 0 if none is recent."""
+    # Those that came before a pause say nothing of now.
+    recent = [moment_s for moment_s in times_s if now_s - moment_s < _RECENT_S]
+    passed_s = recent[-1] - recent[0] if recent else 0.0
+    return (len(recent) - 1) / passed_s if passed_s > 0.0 else 0.0

@@ -213,6 +213,8 @@ def _show_status(content: Mapping[str, Any]) -> None:
             f"  {name:<22} {words:<10} {camera['frames']:>8} {camera['lost']:>6} {rate:>5}"
             + (f"  {camera['detail']}" if camera["detail"] else "")
         )
+    if streaming and "framesets_hz" in content["sync"]:
+        click.echo(f"framesets: {content['sync']['framesets_hz']:.0f} per second")
     for name, count in content["processes"].get("deliver", {}).get("waiting", {}).items():
         click.echo(f"deliver {name}: " + (f"{count} to hand over" if count else "all handed over"))
     counts = scans_by_outcome(content["spool"], content.get("cancelled", 0))

@@ -22,7 +22,7 @@ from station.booth.collection import (
     went_silent_words,
 )
 from station.booth.frame_check import FrameCheck, wrong_sensors
-from station.booth.frameset import Frameset, FramesetMatcher
+from station.booth.frameset import Frameset, FramesetMatcher, rate_hz
 from station.booth.live import LiveCloud, frameset_points, is_empty
 from station.booth.scan_writer import Ended, ScanWriter, Started
 from station.calibration.drift.watch import DriftWatch
@@ -41,6 +41,8 @@ from station.messaging.transport import publisher, server
 from station.sensors.identity import calibrated_serials
 
 _POLL_MS = 20
+_SETS_KEPT = 60
+"""Two seconds of them: on a busy computer they come in bursts."""
 _LATENCIES_KEPT = 2000
 _FLOWING_S = 0.2
 """Age of a camera's last frame up to which its frames flow."""
@@ -73,7 +75,7 @@ class SyncProcess:
         self._cancelled: set[ScanId] = set()
         self._ended: deque[Ended] = deque(maxlen=_ENDED_KEPT)
         self._set_count = 0
-        self._set_times_s: deque[float] = deque(maxlen=config.scan.framesets)
+        self._set_times_s: deque[float] = deque(maxlen=max(config.scan.framesets, _SETS_KEPT))
         self._silent_s = time.monotonic()
         """Last moment at which a camera was silent."""
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES_KEPT)
@@ -314,6 +316,7 @@ class SyncProcess:
                 *(self._wrong_sensors(rig) if (rig := self._live.rig) else []),
             ],
             "framesets": self._set_count,
+            "framesets_hz": rate_hz(self._set_times_s, now_s),
             "latency_p50_s": latencies[len(latencies) // 2] if latencies else None,
             "latency_p99_s": latencies[int(0.99 * len(latencies))] if latencies else None,
             "collecting": None

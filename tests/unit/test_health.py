@@ -16,6 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 from station.booth import operator_cli
+from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
 from station.booth.sync import SyncProcess
@@ -358,6 +359,34 @@ def test_a_console_that_only_starts_is_not_in_the_way_of_scans(config: BoothConf
     health = booth_health(config)
     assert health.processes["console"] == {}
     assert can_scan(config, {**asdict(health), "streaming": True})
+
+
+def test_status_shows_framesets_per_second(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its help promised them, and only JSON had a number of them."""
+    path = str(config.runtime.folder.parent / "booth.toml")
+
+    def shown(*, streaming: bool) -> str:
+        _problems(config, streaming=streaming, silent=[], cameras={}, framesets_hz=29.97)
+        told = {**asdict(booth_health(config)), "streaming": streaming}
+        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
+        return CliRunner().invoke(operator_cli.status, ["--config", path]).output
+
+    assert "framesets: 30 per second\n" in shown(streaming=True)
+    assert "framesets" not in shown(streaming=False)
+    sync = SyncProcess(config, logging.getLogger("sync"))
+    try:
+        assert sync._health()["framesets_hz"] == 0.0
+    finally:
+        sync._writer.close()
+        sync._context.destroy(linger=0)
+
+
+def test_framesets_before_a_pause_do_not_count() -> None:
+    times_s = [0.0, 0.1, 0.2, *(100.0 + np.arange(7) / 30)]
+    assert rate_hz(times_s, 100.2) == pytest.approx(30.0)
+    assert rate_hz(times_s, 103.0) == rate_hz([], 1.0) == rate_hz([0.5], 1.0) == 0.0
 
 
 def test_control_answered_if_it_says_whether_the_sensors_run() -> None:
