@@ -41,3 +41,29 @@ def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> 
             "no calibration has been started; “All remaining steps” goes through all steps",
             timeout=LONG_MS,
         )
+
+
+def test_a_booth_that_takes_no_scans_says_so(console: LiveConsole) -> None:
+    """It looked healthy, and every scan was refused."""
+    calibration = console.config.calibration
+    away = calibration.with_suffix(".away")
+    with browser() as started, console.client("read") as client:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "scan")
+        troubles = page.locator("#troubles")
+        expect(page.locator("#go")).to_be_visible(timeout=LONG_MS)
+        calibration.rename(away)
+        try:
+            expect(troubles).to_contain_text("is not calibrated", timeout=LONG_MS)
+            told = client.get("/booth").json()
+            assert not told["can_scan"]
+            assert any("is not calibrated" in problem for problem in told["problems"])
+            open_view(page, console, "booth")
+            expect(troubles).to_contain_text("is not calibrated", timeout=LONG_MS)
+            page.evaluate("localStorage.setItem('booth.language', 'zh')")
+            page.reload()
+            expect(troubles).to_contain_text("扫描室尚未校准，不能扫描", timeout=LONG_MS)
+        finally:
+            away.rename(calibration)
+        expect(troubles).not_to_contain_text("扫描室尚未校准", timeout=LONG_MS)
