@@ -20,7 +20,8 @@ from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
 from station.core.service import answered
 from station.sensors.freenect import find_library
-from station.simulation.record_cli import PROCEDURE, TRUTH
+from station.simulation.record_cli import HEADING, PROCEDURE, TRUTH
+from station.simulation.scene import default_rig
 
 BODY = Path(__file__).parents[1] / "station/simulation/bodies/ann.npz"
 STATION = (sys.executable, "-m", "station.cli")
@@ -42,6 +43,7 @@ def main() -> int:
         print(f"note: {error}; reading the same recordings with the recorded driver")
         driver = "recorded"
     if not config.exists() or f'"{driver}"' not in config.read_text():
+        clear(booth)
         print("rendering what four Kinects see during a calibration and a scan ...", flush=True)
         options = ("--body", arguments.body, "--out", booth, "--driver", driver)
         calibration = ("--calibration", str(WAVING_S))
@@ -68,6 +70,17 @@ def main() -> int:
         station.send_signal(signal.SIGTERM)
         station.wait(timeout=15)
     return done.returncode
+
+
+def clear(booth: Path) -> None:
+    """Delete what an interrupted demo, or one with another driver, recorded; nothing else."""
+    config = booth / "booth.toml"
+    if config.exists() and not config.read_text().startswith(HEADING):
+        return
+    for name in (PROCEDURE, *default_rig().cameras):
+        shutil.rmtree(booth / name, ignore_errors=True)
+    for name in ("booth.toml", "calibration.json", TRUTH):
+        (booth / name).unlink(missing_ok=True)
 
 
 def discard(procedure: Path) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator
+import signal
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
@@ -26,9 +27,13 @@ from station.simulation.sensor import (
 )
 
 PROCEDURE, TRUTH = "procedure", "true-calibration.json"
+HEADING = "# A virtual booth: four replayed Kinects."
+"""First line of its booth.toml."""
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error if a calibration is recorded."""
 _PROCESSES = 2
+_INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended, as in a shell."""
 
 
 _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
@@ -91,6 +96,8 @@ def record_virtual(
 ) -> None:
     """Render a person in a virtual booth as one recording a camera, with booth.toml.
 
+    A folder that has a booth already is refused.
+
     \b
     Examples:
       station record-virtual --body station/simulation/bodies/ann.npz --out demo/booth
@@ -103,9 +110,10 @@ def record_virtual(
         raise InputError("--hanging is of a calibration: give --calibration SECONDS too")
     if body is not None:
         load_mesh(body)
-    writable_folder(out_folder, "--out")
     bias_m = 0.0 if waving_s is None else _UNIT_BIAS_M
     booth = SimulatedBooth(seed=seed, bias_m=bias_m, clutter=fixed_posts())
+    _refuse_a_booth(out_folder, booth)
+    writable_folder(out_folder, "--out")
     jobs: dict[str, Callable[[], int]] = {
         f"camera {name}": partial(
             _record_person, booth, name, body, out_folder / name, frames, passes
@@ -120,24 +128,8 @@ def record_virtual(
                 jobs[f"{step}, camera {name}"] = partial(
                     _record_step, procedure, name, step, folder
                 )
-    # Spawned: a forked child would share the ray caster's threads.
-    context = multiprocessing.get_context("spawn")
-    ending = partial(die_with_parent, os.getpid())
-    pool = ProcessPoolExecutor(_PROCESSES, mp_context=context, initializer=ending)
-    try:
-        click.echo(f"rendering {len(jobs)} recordings, {_PROCESSES} at a time")
-        running = {pool.submit(job): what for what, job in jobs.items()}
-        for done, job in enumerate(as_completed(running), 1):
-            click.echo(f"{done:3} of {len(jobs)}: {running[job]}, {job.result()} frames")
-    except BaseException:
-        # Who ends the command does not wait for what is being rendered.
-        for renderer in multiprocessing.active_children():
-            renderer.kill()
-        raise
-    finally:
-        # Waited for: the pool's semaphores are released, which outlive the process otherwise.
-        pool.shutdown(cancel_futures=True)
-    lines = ["# A virtual booth: four replayed Kinects.", ""]
+    _render(jobs, out_folder)
+    lines = [HEADING, ""]
     for name in booth.rig.cameras:
         lines += ["[[cameras]]", f'name = "{name}"', f'driver = "{driver}"']
         lines += [f'recording = "{name}"', ""]
@@ -151,6 +143,50 @@ def record_virtual(
             f"calibrate it: station calibrate --config {out_folder / 'booth.toml'} "
             f"--recordings {out_folder / PROCEDURE}"
         )
+
+
+def _refuse_a_booth(folder: Path, booth: SimulatedBooth) -> None:
+    """Refuse a folder in which something would be overwritten.
+
+    Raises:
+        InputError: it has a configuration, a calibration or recordings.
+    """
+    for name in ("booth.toml", "calibration.json", TRUTH, PROCEDURE, *booth.rig.cameras):
+        if os.path.lexists(folder / name):
+            raise InputError(f"{folder / name} exists already; name a new folder with --out")
+
+
+def _render(jobs: Mapping[str, Callable[[], int]], folder: Path) -> None:
+    """Do all jobs, in processes of their own."""
+    # Spawned: a forked child would share the ray caster's threads.
+    context = multiprocessing.get_context("spawn")
+    ending = partial(die_with_parent, os.getpid())
+    pool = ProcessPoolExecutor(_PROCESSES, mp_context=context, initializer=ending)
+    done = 0
+    try:
+        click.echo(f"rendering {len(jobs)} recordings, {_PROCESSES} at a time")
+        # Renderers inherit this: a terminal's Ctrl-C goes to them too, and is this process's to
+        # tell of.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        running = {pool.submit(job): what for what, job in jobs.items()}
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        for done, job in enumerate(as_completed(running), 1):
+            click.echo(f"{done:3} of {len(jobs)}: {running[job]}, {job.result()} frames")
+    except BaseException as cause:
+        # Who ends the command does not wait for what is being rendered.
+        for renderer in multiprocessing.active_children():
+            renderer.kill()
+        if isinstance(cause, KeyboardInterrupt):
+            click.echo(
+                f"stopped; {folder} is incomplete ({done} of {len(jobs)} recordings): delete it "
+                "before you record there again",
+                err=True,
+            )
+            raise SystemExit(_INTERRUPTED) from None
+        raise
+    finally:
+        # Waited for: the pool's semaphores are released, which outlive the process otherwise.
+        pool.shutdown(cancel_futures=True)
 
 
 def _record_person(

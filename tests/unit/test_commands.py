@@ -1,4 +1,5 @@
 import importlib
+import os
 import signal
 import subprocess
 import sys
@@ -185,6 +186,42 @@ def test_rendering_that_is_told_to_end_leaves_no_semaphores(tmp_path: Path) -> N
         _, told = rendering.communicate(timeout=60.0)
     assert rendering.returncode == -signal.SIGTERM
     assert told == b""
+
+
+@pytest.mark.parametrize("name", ["booth.toml", "true-calibration.json", "back-upper"])
+def test_a_booth_is_not_recorded_over(tmp_path: Path, name: str) -> None:
+    """Recordings and the configuration of another booth were replaced without a word."""
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match=f"{name} exists already; name a new folder with --out"):
+        CliRunner().invoke(
+            station_cli.station, ["record-virtual", "--out", str(tmp_path)], catch_exceptions=False
+        )
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None:
+    """As a terminal does, Ctrl-C goes to the renderers too: each showed a traceback."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "station.cli", "record-virtual", "--out", str(out)]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as rendering:
+        deadline_s = time.monotonic() + 60.0
+        while not list(out.glob("*/d-*.pgm")):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        os.killpg(rendering.pid, signal.SIGINT)
+        _, told = rendering.communicate(timeout=60.0)
+    assert rendering.returncode == 130
+    assert told == (
+        f"stopped; {out} is incomplete (0 of 4 recordings): delete it before you record there "
+        "again\n"
+    )
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
