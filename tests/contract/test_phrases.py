@@ -151,6 +151,9 @@ SPOKEN = [
     "the calibration that was started at 2026-11-21 10:00:00 is of other cameras: camera a is "
     "sensor A2, but A1 was calibrated; put the sensors and booth.toml back as they were, or start "
     "again with station calibrate --new",
+    "camera a has moved since it was calibrated: by about 6 mm (mostly forward) and 0.4 degrees "
+    "(mostly to the left)",
+    "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
 ]
 
 

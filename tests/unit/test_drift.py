@@ -18,10 +18,12 @@ from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.last_check import keep_check, last_check
 from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
 from station.calibration.drift.reference import DriftReference, plane_slopes
+from station.calibration.guide.feed import Feed
 from station.core.config_file import load_config
 from station.core.errors import CalibrationError, FormatError
 from station.core.geometry import se3_exp
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
+from station.core.rig import CameraCalibration, Rig
 from station.simulation.noise import TrueView, UnitError, observe
 from station.simulation.scene import (
     Mesh,
@@ -199,6 +201,21 @@ def test_a_move_within_the_tolerance_never_alarms_and_words_say_where() -> None:
     assert np.abs(unsure.known()).max() < 0.001
 
 
+def test_a_move_that_the_view_shows_only_roughly_is_not_told_as_none() -> None:
+    """It was told as "by about 0 mm and 0.1 degrees"."""
+    rough = np.diag([1e-4**2] * 3 + [0.004**2, 1e-4**2, 1e-4**2])
+    aside = CameraMove("a", np.array([0, 0, 1e-3, 0.05, 0, 0]), rough, 1.0)
+    assert aside.moved
+    assert aside.words() == (
+        "camera a has moved since it was calibrated, in a direction that its view shows only "
+        "roughly"
+    )
+    turned = CameraMove("a", np.array([0, 0, 0.01, 0.05, 0, 0]), rough, 1.0)
+    assert turned.words().endswith(": by about 0.6 degrees (mostly clockwise)")
+    shifted = CameraMove("a", np.array([0, 0, 0, 0.05, 0, -0.009]), rough, 1.0)
+    assert shifted.words().endswith(": by about 9 mm (mostly back)")
+
+
 def test_slopes_hold_beside_gaps() -> None:
     """Slopes of blurred images are too small there: a floor then seems to change as a camera moves
     along it."""
@@ -326,14 +343,49 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     assert (last["moved"], last["changed"]) == ([], ["a"])
 
 
+def _rig(names: str, serial: str = "") -> Rig:
+    cameras = {name: replace(CAMERA, name=name, serial=serial) for name in names}
+    return replace(default_rig(), cameras=cameras, reference=names[0])
+
+
 def test_cameras_without_a_picture_of_the_empty_booth_are_named(tmp_path: Path) -> None:
     """Several were "camera a, b"."""
-    default_rig().save(tmp_path / "calibration.json")
     section = '[[cameras]]\nname = "{0}"\ndriver = "recorded"\nrecording = "{0}"\n'
     for names, words in (("a", "camera a;"), ("ab", "cameras a, b;")):
+        _rig(names).save(tmp_path / "calibration.json")
         (tmp_path / "booth.toml").write_text("".join(map(section.format, names)))
         with pytest.raises(CalibrationError, match=f"no picture of the empty booth by {words}"):
             check_cli._moves(load_config(tmp_path / "booth.toml"), None, quiet=True)
+
+
+def test_cameras_that_were_not_calibrated_are_not_checked(tmp_path: Path) -> None:
+    """A sensor that had been exchanged was compared with the picture of another one."""
+    section = '[[cameras]]\nname = "{0}"\ndriver = "recorded"\nrecording = "{0}"\nserial = "{1}"\n'
+    _rig("ab", "A1").save(tmp_path / "calibration.json")
+    for cameras, words in (
+        ({"a": "A1"}, "camera b was calibrated and is not in booth.toml"),
+        ({"a": "A1", "b": "B2"}, "camera b is sensor B2, but A1 was calibrated"),
+    ):
+        sections = (section.format(name, serial) for name, serial in cameras.items())
+        (tmp_path / "booth.toml").write_text("".join(sections))
+        with pytest.raises(CalibrationError, match=f"{words}; put the sensors and booth.toml"):
+            check_cli._moves(load_config(tmp_path / "booth.toml"), None, quiet=True)
+
+
+class _Exchanged(Feed):
+    """Sensors that are not those that booth.toml once named."""
+
+    def __init__(self) -> None:
+        pass
+
+    def cameras(self, timeout_s: float) -> dict[str, CameraCalibration]:
+        del timeout_s
+        return dict(_rig("a", "B2").cameras)
+
+
+def test_a_sensor_that_was_not_calibrated_is_not_looked_at() -> None:
+    with pytest.raises(CalibrationError, match="camera a is sensor B2, but A1 was calibrated; put"):
+        check_cli._look(_Exchanged(), _rig("a", "A1"), ["a"], quiet=True)
 
 
 def test_cameras_that_share_unseen_directions_are_told_together(
@@ -346,7 +398,8 @@ def test_cameras_that_share_unseen_directions_are_told_together(
         CameraMove(name, np.zeros(6), covariance, 1.0)
         for name, covariance in (("a", blind), ("b", sharp), ("c", blind))
     ]
-    words = ", ".join(moves[0].unseen_words())
+    *first, last = moves[0].unseen_words()
+    words = f"{', '.join(first)} or {last}" if first else last
     assert "shift sideways" in words
     check_cli._tell(moves, [], moved=False)
     assert capsys.readouterr().out.splitlines() == [

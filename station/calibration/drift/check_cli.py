@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -24,6 +24,7 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.files import utc_now
 from station.core.rig import Rig
+from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
 _FRAMES = 30
 _SENSORS_S = 20.0
@@ -95,8 +96,14 @@ def _correct(config: BoothConfig) -> None:
 
 
 def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[CameraMove]:
-    """Estimates of how far each camera stands from where it was calibrated."""
+    """Estimates of how far each camera stands from where it was calibrated.
+
+    Raises:
+        CalibrationError: cameras or sensors are not those of the calibration, or its picture of
+            the empty booth lacks one.
+    """
     rig = Rig.load(config.calibration)
+    _refuse_others(rig, configured_serials(config.cameras))
     scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
     names = [camera.name for camera in config.cameras]
     missing = [name for name in names if name not in scene]
@@ -105,11 +112,9 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
             f"the calibration in use ({config.calibration}) has no picture of the empty booth by "
             f"{_cameras(missing)}; calibrate with station calibrate"
         )
-    if others := [name for name in scene if name not in names]:
-        click.echo(f"not in booth.toml, and not looked at: {_cameras(others)}", err=True)
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
-        taken = _look(feed, names, quiet)
+        taken = _look(feed, rig, names, quiet)
     return [
         estimate_move(
             DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),
@@ -143,7 +148,7 @@ def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
     """Lines on the directions that views cannot show, one for all cameras that share them."""
     cameras: dict[str, list[str]] = {}
     for move in moves:
-        if not move.lost and (words := ", ".join(move.unseen_words())):
+        if not move.lost and (words := _either(move.unseen_words())):
             cameras.setdefault(words, []).append(move.camera)
     lines = [
         f"{_cameras(names)}: a small {words} cannot be detected" for words, names in cameras.items()
@@ -153,12 +158,22 @@ def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
     return lines
 
 
+def _either(words: Sequence[str]) -> str:
+    return " or ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
 def _cameras(names: Sequence[str]) -> str:
     return f"camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
 
 
-def _look(feed: Feed, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:
-    feed.cameras(_SENSORS_S)
+def _refuse_others(rig: Rig, serials: Mapping[str, str]) -> None:
+    """Refuse a booth that is not the calibrated one, as scans do: it would tell nothing of it."""
+    if words := mismatch(calibrated_serials(rig.cameras), serials):
+        raise CalibrationError(words)
+
+
+def _look(feed: Feed, rig: Rig, names: list[str], quiet: bool) -> dict[str, list[TimedFrame]]:
+    _refuse_others(rig, calibrated_serials(feed.cameras(_SENSORS_S)))
     guide = Guide(attended=False, countdown_s=0.0)
     taken = gather_frames(feed, names, _FRAMES, (lambda _: None) if quiet else guide.progress)
     guide.end_line()

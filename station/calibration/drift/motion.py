@@ -168,7 +168,14 @@ class CameraMove:
             )
         if not self.moved:
             return f"camera {self.camera} stands where it was calibrated"
-        return f"camera {self.camera} has moved since it was calibrated: {move_words(self.known())}"
+        known = self.known()
+        if np.linalg.norm(known[:3]) < QUIET_RAD and np.linalg.norm(known[3:]) < QUIET_M:
+            # So much never alarms: what does lies where the view shows too little to give a size.
+            return (
+                f"camera {self.camera} has moved since it was calibrated, in a direction that its "
+                "view shows only roughly"
+            )
+        return f"camera {self.camera} has moved since it was calibrated: {move_words(known)}"
 
     def known(self) -> Array:
         """The move (6,) without the components that this view does not determine."""
@@ -219,12 +226,19 @@ def _along_axis(move: CameraMove) -> tuple[float, float]:
 
 
 def move_words(xi: Array) -> str:
-    """A move (6,) in the camera frame: how far it shifted and turned, and where mostly."""
+    """A move (6,) in the camera frame: how far it shifted and turned, and where mostly.
+
+    Of a shift and a turn, one that would be told as 0 is not told.
+    """
     turn, shift = int(np.argmax(np.abs(xi[:3]))), 3 + int(np.argmax(np.abs(xi[3:])))
-    millimetres = 1e3 * np.linalg.norm(xi[3:])
-    degrees = np.degrees(np.linalg.norm(xi[:3]))
+    millimetres = f"{1e3 * np.linalg.norm(xi[3:]):.0f}"
+    degrees = f"{np.degrees(np.linalg.norm(xi[:3])):.1f}"
+    if degrees == "0.0":
+        return f"by about {millimetres} mm (mostly {_side(xi, shift)})"
+    if millimetres == "0":
+        return f"by about {degrees} degrees (mostly {_side(xi, turn)})"
     return (
-        f"by about {millimetres:.0f} mm (mostly {_side(xi, shift)}) and {degrees:.1f} degrees "
+        f"by about {millimetres} mm (mostly {_side(xi, shift)}) and {degrees} degrees "
         f"(mostly {_side(xi, turn)})"
     )
 
