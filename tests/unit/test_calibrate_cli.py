@@ -159,6 +159,14 @@ def test_a_list_says_what_was_seen_so_far(config: Path, store: CalibrationStore)
     assert listed == f"  unfinished, started {local_time(STARTED)}: nothing yet\n"
 
 
+def test_a_calibration_from_elsewhere_is_listed(config: Path, store: CalibrationStore) -> None:
+    """The list said that there was no calibration while the booth used one."""
+    default_rig().save(store.in_use)
+    assert _run(config, "--list").output == (
+        f"* {store.in_use}  in use; it is none of {store.folder}\n"
+    )
+
+
 def test_abandoned_calibrations_are_listed(config: Path, store: CalibrationStore) -> None:
     """Nothing but the folder's name told of them."""
     for _ in range(10):

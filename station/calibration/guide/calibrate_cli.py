@@ -141,8 +141,10 @@ def _list(procedure: Procedure) -> None:
     from station.calibration.solve.refusals import SIGMAS_95
 
     entries, session = list(procedure.store.entries()), procedure.unfinished_session()
-    abandoned = procedure.store.abandoned()
-    if not entries and not abandoned and session is None:
+    abandoned, elsewhere = procedure.store.abandoned(), procedure.store.from_elsewhere()
+    if elsewhere:
+        click.echo(f"* {procedure.store.in_use}  in use; it is none of {procedure.store.folder}")
+    elif not entries and not abandoned and session is None:
         click.echo("no calibration yet; station calibrate makes one")
     for entry in entries:
         mark = "*" if entry.in_use else " "

@@ -102,6 +102,10 @@ class CalibrationStore:
         """Name of the calibration that the booth reads; empty if it is none of the stored ones."""
         return next((folder.name for folder in self._folders() if self._is_used(folder)), "")
 
+    def from_elsewhere(self) -> bool:
+        """Whether the booth reads a calibration that is none of the stored ones."""
+        return self.in_use.exists() and not self.name_in_use()
+
     def newest(self) -> str | None:
         """Name of the last stored calibration, if there is one."""
         return max((folder.name for folder in self._folders()), default=None)
@@ -185,7 +189,7 @@ class CalibrationStore:
         words = mismatch(calibrated_serials(rig.cameras), configured_serials(cameras))
         if cameras and words:
             raise CalibrationError(f"calibration {name} cannot be used: {words}")
-        if self.in_use.exists() and not any(map(self._is_used, folders.values())):
+        if self.from_elsewhere():
             self._adopt()
         write_bytes(self.in_use, (folders[name] / CALIBRATION).read_bytes())
         return Entry(name, folders[name], rig, in_use=True)
