@@ -253,12 +253,19 @@ def test_the_readme_client_works(console: LiveConsole, tmp_path: Path) -> None:
     assert command is not None
     assert program is not None
     assert set(re.findall(r"--scope (\w+)", command[1])) == {"read", "scan"}
-    assert len(program[1].splitlines()) <= 36
+    assert len(program[1].splitlines()) <= 40
     path = tmp_path / "client.py"
     path.write_text(program[1])
-    done = subprocess.run(
-        [sys.executable, str(path), console.url, console.tokens["scan"], "Order 99"],
-        capture_output=True, text=True, timeout=120, check=False,
+    done, refused = (
+        subprocess.run(
+            [sys.executable, str(path), console.url, console.tokens[scope], "Order 99"],
+            capture_output=True, text=True, timeout=120, check=False,
+        )
+        for scope in ("scan", "read")
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "waist_girth" in done.stdout
+    # A refusal was a traceback with "409 Conflict", and its reason was not read.
+    assert refused.returncode == 1
+    assert "scope" in refused.stderr
+    assert refused.stderr.count("\n") == 1
