@@ -56,13 +56,31 @@ def test_every_stage_is_drawn(bundle: Path, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     names = sorted(path.name for path in pictures.iterdir())
     rounds = [name for name in names if name.startswith("3-correspondences-")]
-    assert len(rounds) >= 5
+    # The first of each stage and the last: neighbours looked the same.
+    assert [int(name[-6:-4]) for name in rounds] == [1, 5, 9, 12, 15, 17]
     others = ["1-cloud.png", "2-start.png", "4-joint.png", "5-surface.png", "6-done.png"]
     assert [name for name in names if name not in rounds] == others
     for name in names:
         assert 0.08 < _ink(pictures / name) < 0.6, name
     # Pictures of a body are as private as its scan.
     assert pictures.stat().st_mode & 0o077 == 0
+    # Pictures of two fits lay in one folder, where nobody could tell them apart.
+    words[2] = str(tmp_path / "other")
+    with pytest.raises(InputError, match=r"has pictures of a fit already; .* with --debug"):
+        CliRunner().invoke(fit, words, catch_exceptions=False)
+    assert not (tmp_path / "other").exists()
+
+
+def test_rounds_of_a_long_stage_are_drawn_now_and_then(model: BodyModel, tmp_path: Path) -> None:
+    draw = DebugPictures(tmp_path / "pictures", model.faces)
+    draw("cloud", {"points": model.mean, "normals": vertex_normals(model.mean, model.faces)})
+    some = model.mean[::50]
+    pairs = {"vertices": model.mean, "on_body": some, "on_cloud": some + 0.01}
+    for _ in range(8):
+        draw("correspondences", {**pairs, "gate_m": np.array(0.05)})
+    draw("joint", {"vertices": model.mean})
+    names = sorted(path.name for path in (tmp_path / "pictures").glob("3-*"))
+    assert names == [f"3-correspondences-{number:02d}.png" for number in (1, 6, 8)]
 
 
 def test_folders_that_cannot_be_made_are_refused_before_the_work(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from workers.pictures.render import (
     draw_line,
     draw_points,
     png,
+    text_width,
     write_text,
 )
 from workers.scape.fit.observer import Event
@@ -31,6 +32,11 @@ _WIDTH, _HEIGHT = 430, 700
 _MARGIN = 1.08
 _TITLE_SIZE = 18
 _TITLE_AT = (14, 26)
+_NAMES = {"front": "front", "side": "left side", "back": "back"}
+"""Names of the views; the side that is drawn is the person's left one."""
+_NAME_SIZE, _NAME_ABOVE = 15, 14
+_ROUNDS_LEFT_OUT = 4
+"""Rounds between two that are drawn, of one stage: neighbours look the same."""
 _POINT = np.array([170, 90, 20], np.uint8)
 _PAIR_NEAR, _PAIR_FAR = np.array([60.0, 160.0, 40.0]), np.array([40.0, 40.0, 220.0])
 _FAR_PAIR_M = 0.05
@@ -41,25 +47,35 @@ _OUTSIDE, _INSIDE = np.array([60.0, 60.0, 235.0]), np.array([235.0, 120.0, 50.0]
 _MET, _UNSEEN = np.array([225.0, 235.0, 225.0]), np.array([150.0, 150.0, 150.0])
 _CLOSE_M = 0.01
 _BARE_DARK, _BARE_LIGHT = 60.0, 200.0
+_OVER = "blue: points of the scan (those inside or behind the body are hidden)"
 _BODY_EVENTS = {
-    "start": (2, "start; points of the scan over it"),
-    "joint": (4, "model fitted (pose and shape); points of the scan over it"),
-    "done": (6, "result; points of the scan over it"),
+    "start": (2, f"start; {_OVER}"),
+    "joint": (4, f"model fitted (pose and shape); {_OVER}"),
+    "done": (6, f"result; {_OVER}"),
 }
 """Stages that are drawn as the body with the cloud over it: number and title."""
+
+
+def has_pictures(folder: Path) -> bool:
+    """Whether a folder has pictures of a fit."""
+    return any(folder.glob("[1-6]-*.png"))
 
 
 class DebugPictures:
     """Observer of a fit that draws each stage from the front, the side and the back.
 
     Files in `folder`, in the order of the fit: 1-cloud.png, 2-start.png,
-    3-correspondences-NN.png, 4-joint.png, 5-surface.png (an error map), 6-done.png.
+    3-correspondences-NN.png, 4-joint.png, 5-surface.png (an error map), 6-done.png. Correspondences
+    are drawn of the first round of each stage of the fit, of every fifth of a long one,
+    and of the last.
     """
 
     def __init__(self, folder: Path, faces: NDArray[np.int32]) -> None:
         self._folder = private_folder(folder)
         self._faces = faces
-        self._rounds = 0
+        self._rounds = self._drawn = 0
+        self._gate_m = np.nan
+        self._pairs: tuple[Array, Array, Array] | None = None
         self._points: Array = np.empty((0, 3))
         self._normals: Array = np.empty((0, 3))
 
@@ -68,21 +84,40 @@ class DebugPictures:
             self._points, self._normals = arrays["points"].copy(), arrays["normals"].copy()
             self._write("1-cloud", f"cloud: {len(self._points):,} points", self._bare)
             return
-        scene = Scene(arrays["vertices"], self._faces)
         if event == "correspondences":
-            self._draw_pairs(scene, arrays["on_body"], arrays["on_cloud"])
-        elif event == "surface":
+            self._see_round(arrays)
+            return
+        self._draw_round()
+        scene = Scene(arrays["vertices"], self._faces)
+        if event == "surface":
             self._draw_errors(scene, arrays["residual_m"])
         else:
             number, title = _BODY_EVENTS[event]
             self._write(f"{number}-{event}", title, lambda frame: self._over(scene, frame))
 
-    def _draw_pairs(self, scene: Scene, on_body: Array, on_cloud: Array) -> None:
+    def _see_round(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         self._rounds += 1
+        # Kept until the next: nobody says of a round that it is the last.
+        vertices, on_body, on_cloud = (
+            arrays[name].copy() for name in ("vertices", "on_body", "on_cloud")
+        )
+        self._pairs = vertices, on_body, on_cloud
+        gate_m = float(arrays["gate_m"])
+        if gate_m != self._gate_m or self._rounds - self._drawn > _ROUNDS_LEFT_OUT:
+            self._gate_m = gate_m
+            self._draw_round()
+
+    def _draw_round(self) -> None:
+        """Draw the pairs of the last round, once."""
+        if self._pairs is None:
+            return
+        vertices, on_body, on_cloud = self._pairs
+        self._pairs, self._drawn = None, self._rounds
+        scene = Scene(vertices, self._faces)
         away = np.linalg.norm(on_cloud - on_body, axis=1)
         middle_mm = 1e3 * float(np.median(away)) if len(away) else float("nan")
         title = f"round {self._rounds}: {len(away):,} pairs, median {middle_mm:.1f} mm"
-        title += "; green: near, red: far"
+        title += f"; green: 0 mm, red: {1e3 * _FAR_PAIR_M:.0f} mm or more"
         name = f"3-correspondences-{self._rounds:02d}"
         self._write(name, title, lambda frame: _paired(scene, on_body, on_cloud, frame))
 
@@ -90,7 +125,10 @@ class DebugPictures:
         seen = residual_m[np.isfinite(residual_m)]
         rms_mm = 1e3 * float(np.sqrt(np.mean(seen**2))) if len(seen) else float("nan")
         limit = f"{1e3 * _WORST_SHOWN_M:.0f} mm"
-        title = f"error: rms {rms_mm:.2f} mm; red: points {limit} outside, blue: inside, grey: none"
+        title = (
+            f"error: rms {rms_mm:.2f} mm; points lie on the body: white, {limit} or more outside: "
+        )
+        title += "red, inside: blue; no points: dark grey"
         colors = self._error_colors(residual_m)
         self._write("5-surface", title, lambda frame: scene.render(frame, colors).picture)
 
@@ -105,6 +143,9 @@ class DebugPictures:
     def _write(self, name: str, title: str, draw: Callable[[Frame], Picture]) -> None:
         picture = np.concatenate([draw(self._frame(view)) for view in VIEWS], axis=1)
         write_text(picture, title, _TITLE_AT, size=_TITLE_SIZE)
+        for number, view in enumerate(VIEWS):
+            left = int((number + 0.5) * _WIDTH - 0.5 * text_width(_NAMES[view], size=_NAME_SIZE))
+            write_text(picture, _NAMES[view], (left, _HEIGHT - _NAME_ABOVE), size=_NAME_SIZE)
         (self._folder / f"{name}.png").write_bytes(png(picture))
 
     def _bare(self, frame: Frame) -> Picture:

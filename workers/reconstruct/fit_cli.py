@@ -42,7 +42,8 @@ from workers.scape.fit.fit import Method
     "--debug",
     "debug_folder",
     type=click.Path(path_type=Path),
-    help="folder for pictures of every stage: cloud, pairs, body over cloud, error map",
+    help="new folder for pictures of every stage: cloud, pairs, body over cloud, error map; "
+    "without it, none are drawn",
 )
 @click.option("--quiet", is_flag=True, help="no progress")
 def fit(
@@ -145,12 +146,18 @@ def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:
     """Make what the new folders lie in, before any work is done for them.
 
     Raises:
-        InputError: one of them cannot be made.
+        InputError: one of them cannot be made, or holds another fit's files.
     """
     # A link that leads nowhere does not exist, but a folder cannot take its name.
     if os.path.lexists(out_folder):
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
     writable_folder(out_folder.parent, "--out")
     if debug_folder is not None:
+        from workers.pictures.debug_pictures import has_pictures
+
+        if has_pictures(debug_folder):
+            raise InputError(
+                f"{debug_folder} has pictures of a fit already; name a new folder with --debug"
+            )
         # Pictures of a body are as private as its scan.
         writable_folder(debug_folder, "--debug", PRIVATE_FOLDER_MODE)

@@ -109,6 +109,7 @@ def fit_jointly(
             )
             if observer is not unobserved:
                 drawn = {"on_body": terms.on_body, "on_cloud": terms.on_cloud}
+                drawn["gate_m"] = np.array(annealing.gate_m)
                 observer("correspondences", {"vertices": model.vertices(state), **drawn})
             state, cameras, evidence = _step(
                 model,

@@ -17,8 +17,8 @@ class Observer(Protocol):
 
     - "cloud": `points` (n, 3), `normals` (n, 3), the points that are fitted to.
     - "start": `vertices` (P, 3), the body before the first step.
-    - "correspondences", once an iteration: `vertices` (P, 3), and `on_body` and `on_cloud`, (m, 3)
-      each, the pairs.
+    - "correspondences", once an iteration: `vertices` (P, 3), `on_body` and `on_cloud`, (m, 3)
+      each, the pairs, and `gate_m` (), their largest distance, which is less in each stage.
     - "joint": `vertices` (P, 3) of the fitted model.
     - "surface": `vertices` (P, 3) fitted to the data, `residual_m` (P,), mean signed distance of
       a vertex's points along its normal, NaN where it has none.

@@ -58,7 +58,9 @@ def fit_like_the_paper(
     for iteration in range(1, _MAX_ITERATIONS + 1):
         mesh, pairs = align_rigidly(model, target, mesh)
         on_body, on_cloud = mesh[pairs[0]], target.tree.points[pairs[1]]
-        observer("correspondences", {"vertices": mesh, "on_body": on_body, "on_cloud": on_cloud})
+        drawn = {"on_body": on_body, "on_cloud": on_cloud}
+        drawn["gate_m"] = np.array(MAX_CORRESPONDENCE_DISTANCE_M)
+        observer("correspondences", {"vertices": mesh, **drawn})
         state = solve_pose_and_shape(model, mesh, state, pairs, target)
         solved = solve_mesh(model.vertices(state), pairs, target)
         change_m = float(np.sqrt(np.mean(np.sum((solved - mesh) ** 2, axis=1))))
