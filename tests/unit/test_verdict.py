@@ -202,7 +202,7 @@ def test_a_half_seen_part_next_to_an_unseen_one_is_missing(model: BodyModel) -> 
     ]
     sides = {"front": 0.9, "back": 0.9}
     verdict = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
-    assert verdict.reasons == ("the cameras saw only 0 % of the left hand",)
+    assert verdict.reasons == ("nothing of the left hand was seen",)
     assert set(verdict.missing) == {"forearm_left", "hand_left"}
     # Readings beside the body are the missing limb's.
     beside = {"": "338 cm2 of the scan do not belong to the person"}
@@ -222,7 +222,7 @@ def test_a_part_far_from_its_points_is_missing_in_a_bad_scan_alone(model: BodyMo
 def test_many_unseen_parts_are_counted(model: BodyModel) -> None:
     parts = [PartReport(name, 0.05, 1e-3) for name in model.part_names[:8]]
     verdict = judge(parts, {}, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
-    assert verdict.reasons == ("the cameras hardly saw 8 of 8 parts of the body",)
+    assert verdict.reasons == ("the cloud hardly shows 8 of 8 parts of the body",)
     assert set(verdict.missing) >= {part.name for part in parts}
 
 
@@ -280,9 +280,10 @@ def test_a_small_patch_widens_the_skin_beside_it(
 
 def test_a_person_of_whom_one_side_is_missing_is_not_measured(model: BodyModel) -> None:
     parts = [PartReport("abdomen", 0.48, 1e-3), PartReport("hand_left", 0.85, 1e-3)]
-    sides = {"front": 0.9, "back": 0.02}
+    sides = {"front": 0.9, "back": 0.002}
     found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
     assert found.status == "rescan"
+    assert found.reasons == ("nothing of the person's back was seen",)
     assert found.missing == ("abdomen",)
 
 
@@ -291,7 +292,10 @@ def test_a_person_whose_left_side_is_missing_is_not_measured(model: BodyModel) -
     parts = [PartReport("abdomen", 0.55, 1e-3), PartReport("thigh_left", 0.3, 1e-3)]
     sides = {"front": 0.7, "back": 0.7, "left side": 0.5, "right side": 0.8}
     found = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {}, 1e-3)
-    assert found.reasons == ("the cameras saw only 50 % of the person's left side",)
+    # It was said of cameras also where there are none: of a bare cloud.
+    assert found.reasons == ("the cloud shows only 50 % of the person's left side",)
+    booth = judge(parts, sides, (), {}, 1.75, np.zeros(model.beta_count), {"a": 0.0}, 1e-3)
+    assert booth.reasons == ("the cameras saw only 50 % of the person's left side",)
     assert found.missing == ("abdomen", "thigh_left")
 
 

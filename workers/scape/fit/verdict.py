@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.correspondence import OrientedTree
+from workers.scape.fit.seen_words import little_seen, many_hardly_seen, part_in_words
 from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
 from workers.scape.model.deformation import vertex_areas, vertex_normals
@@ -195,13 +196,14 @@ def judge(
         findings: what preprocessing, `leaning` and `off_floor` noticed; each is a reason.
         lost: what `lost_parts` gives.
         beta: (B,), shape coefficients.
-        camera_shifts_m: how far the fit moved each camera's points.
+        camera_shifts_m: how far the fit moved each camera's points; empty for a bare cloud.
         rms_m: distance of the points from the surface.
         misplaced: what `head_turned`, `arms_inside`, `feet_cut_off` and `head_cut_off` give.
     """
-    unseen = _unseen_parts(parts)
+    cameras = bool(camera_shifts_m)
+    unseen = _unseen_parts(parts, cameras=cameras)
     moved, notes = _moved_cameras(camera_shifts_m)
-    halves = _unseen_sides(sides)
+    halves = _unseen_sides(sides, cameras=cameras)
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
     stature = _stature_of_nobody(stature_m)
@@ -211,12 +213,12 @@ def judge(
     if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         reasons.append("what stands in the booth does not look like a person")
     if everywhere:
-        reasons.append(_NO_BODY if camera_shifts_m else f"{_NO_BODY}; {_ON_ITS_HEAD}")
+        reasons.append(_NO_BODY if cameras else f"{_NO_BODY}; {_ON_ITS_HEAD}")
     # What lies beside a body whose arm or head was not found may be that.
     told = [reason for part, reason in lost.items() if part or not misplaced]
     reasons += [*halves, *told[:_PARTS_NAMED]]
     if len(unseen) > _PARTS_NAMED:
-        reasons.append(f"the cameras hardly saw {len(unseen)} of {len(parts)} parts of the body")
+        reasons.append(many_hardly_seen(len(unseen), len(parts), cameras=cameras))
     else:
         reasons += [reason for part, reason in unseen.items() if part not in misplaced]
     reasons += stature if cut else []
@@ -224,13 +226,13 @@ def judge(
         # What does not match a body, or does not look like one, comes of it.
         reasons = [finding.message for finding in findings]
     if not reasons and rms_m > _SCATTER_M:
-        remedy = "run: station check" if camera_shifts_m else "clean the cloud, or scan again"
+        remedy = "run: station check" if cameras else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
     missing = [*(name for name in lost if name), *unseen]
     if reasons:
         missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
     missing = _with_rest_of_limbs(missing, lost, parts)
-    if not camera_shifts_m and not _FEET.isdisjoint(missing):
+    if not cameras and not _FEET.isdisjoint(missing):
         # Only feet show where the floor of a bare cloud is; legs without them were pressed to it.
         missing += [FLOOR, *(part for limb in _limbs() if limb[-1] in _FEET for part in limb[1:])]
     missing += [FLOOR for finding in findings if finding.code in OFF_FLOOR]
@@ -255,23 +257,22 @@ def _stature_of_nobody(stature_m: float) -> list[str]:
     ]
 
 
-def _unseen_sides(sides: Mapping[str, float]) -> list[str]:
+def _unseen_sides(sides: Mapping[str, float], *, cameras: bool) -> list[str]:
     best = max((sides.get(f"{name} side", 0.0) for name in _LIMBS), default=0.0)
     return [
-        f"the cameras saw only {100 * share:.0f} % of the person's {side}"
+        little_seen(share, f"person's {side}", cameras=cameras)
         for side, share in sides.items()
         if share < _MIN_COVERAGE or (side.endswith("side") and share < _OTHER_SIDE * best)
     ]
 
 
-def _unseen_parts(parts: Sequence[PartReport]) -> dict[str, str]:
-    """Reasons by the part that the cameras hardly saw."""
+def _unseen_parts(parts: Sequence[PartReport], *, cameras: bool) -> dict[str, str]:
+    """Reasons by the part that was hardly seen."""
     reasons = {}
     for part in parts:
         extremity = part.name.startswith(_EXTREMITIES)
         if part.coverage < (_MIN_EXTREMITY_COVERAGE if extremity else _MIN_COVERAGE):
-            words = part_in_words(part.name)
-            reason = f"the cameras saw only {100 * part.coverage:.0f} % of the {words}"
+            reason = little_seen(part.coverage, part_in_words(part.name), cameras=cameras)
             if part.name == "head":
                 reason += "; cover dark hair with a light cap"
             reasons[part.name] = reason
@@ -343,9 +344,3 @@ def _with_rest_of_limbs(
             first -= 1
         found += limb if limb[1] in lost or "" in lost else limb[first:]
     return found
-
-
-def part_in_words(part: str) -> str:
-    """Name of a part for the operator: "left forearm" of "forearm_left"."""
-    stem, _, side = part.rpartition("_")
-    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part

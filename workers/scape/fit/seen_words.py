@@ -1,0 +1,30 @@
+"""Words on how much of the body was seen (pure)."""
+
+from __future__ import annotations
+
+
+def part_in_words(part: str) -> str:
+    """Name of a part for the operator: "left forearm" of "forearm_left"."""
+    stem, _, side = part.rpartition("_")
+    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
+
+
+def little_seen(share: float, what: str, *, cameras: bool) -> str:
+    """Sentence on a part or side of which too small a share was seen.
+
+    Args:
+        cameras: whether the scan comes from the booth's; a bare cloud has none.
+    """
+    percent = f"{100 * share:.0f}"
+    if percent == "0":
+        return f"nothing of the {what} was seen"
+    if cameras:
+        return f"the cameras saw only {percent} % of the {what}"
+    return f"the cloud shows only {percent} % of the {what}"
+
+
+def many_hardly_seen(count: int, total: int, *, cameras: bool) -> str:
+    """Sentence on more parts than can be named."""
+    if cameras:
+        return f"the cameras hardly saw {count} of {total} parts of the body"
+    return f"the cloud hardly shows {count} of {total} parts of the body"
