@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import click
+from station.core.start.interrupts import loading
 
-from station import __version__
-from station.core.commands import LazyGroup, run
+with loading():
+    import click
+
+    from station import __version__
+    from station.core.commands import LazyGroup, run
 
 COMMANDS = {
     "fit": ("workers.reconstruct.fit_cli:fit", "reconstruct one scan bundle or point cloud"),

@@ -20,6 +20,7 @@ import click
 
 from station.core.errors import BoothError, InputError
 from station.core.service import set_up_caches
+from station.core.start.interrupts import loading
 
 config_option = click.option(
     "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
@@ -82,7 +83,8 @@ class LazyGroup(click.Group):
         if cmd_name not in self._lazy:
             return super().get_command(ctx, cmd_name)
         module, attribute = self._lazy[cmd_name][0].split(":")
-        command = getattr(importlib.import_module(module), attribute)
+        with loading():
+            command = getattr(importlib.import_module(module), attribute)
         assert isinstance(command, click.Command)
         return command
 

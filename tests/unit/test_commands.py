@@ -224,6 +224,43 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
     )
 
 
+@pytest.mark.parametrize(
+    ("module", "command"),
+    [
+        ("click", ["-m", "station.cli"]),
+        ("click", ["-m", "workers.cli"]),
+        (
+            "slow",
+            [
+                "-c",
+                "from station.core.commands import LazyGroup, run; "
+                "run(LazyGroup(lazy={'it': ('slow:it', '')}))",
+                "it",
+            ],
+        ),
+    ],
+)
+def test_a_command_that_is_interrupted_while_it_loads_is_silent(
+    tmp_path: Path, module: str, command: list[str]
+) -> None:
+    """Ctrl-C in the first half second showed a traceback."""
+    source = "import time\nprint('loads', flush=True)\ntime.sleep(60)\n"
+    (tmp_path / f"{module}.py").write_text(source)
+    with subprocess.Popen(
+        [sys.executable, *command],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as starting:
+        assert starting.stdout is not None
+        assert starting.stdout.readline() == "loads\n"
+        starting.send_signal(signal.SIGINT)
+        assert starting.communicate(timeout=20.0) == ("", "")
+    # 130 in a shell.
+    assert starting.returncode == -signal.SIGINT
+
+
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     """A traceback once told an operator nothing about the file that was missing."""
     missing = tmp_path / "booth.toml"
