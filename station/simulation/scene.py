@@ -57,7 +57,9 @@ def load_mesh(path: Path) -> Mesh:
                 vertices = archive["vertices"].astype(np.float64)
                 faces = archive["faces"].astype(np.int32)
         else:
-            mesh = o3d.io.read_triangle_mesh(str(path))
+            # Its own warnings would stand before the error that says what to do.
+            with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+                mesh = o3d.io.read_triangle_mesh(str(path))
             vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int32)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as cause:
         raise InputError(

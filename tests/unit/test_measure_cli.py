@@ -46,6 +46,9 @@ def test_meshes_are_measured_without_a_fit(model: BodyModel, tmp_path: Path) -> 
     assert "\nWaist girth " in table
     assert "\nInside leg " in table
     assert "\nVolume " in table
+    # Intervals were announced, and none followed.
+    assert "Values:\n" in table
+    assert "interval" not in table
 
 
 def test_a_results_tables_are_printed_with_their_intervals(

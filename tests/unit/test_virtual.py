@@ -211,3 +211,13 @@ def test_an_unusable_body_is_named(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"body\.npz"):
         load_mesh(path)
+
+
+def test_what_is_no_mesh_is_refused_without_other_words(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A coloured warning of the library stood before the error."""
+    (tmp_path / "README.md").write_text("no mesh")
+    with pytest.raises(InputError, match="holds no usable mesh"):
+        load_mesh(tmp_path / "README.md")
+    assert capfd.readouterr() == ("", "")

@@ -195,7 +195,11 @@ def _print_table(document: dict[str, Any]) -> None:
     words = {definition.name: definition.words for definition in DEFINITIONS}
     for name, text in _heading(document):
         click.echo(f"{name.replace('_', ' ')}: {_plain(text)}")
-    click.echo("Values with 95 % intervals:")
+    exact = not any(
+        row["value_m"] is not None and row["interval95_m"][0] < row["interval95_m"][1]
+        for row in document["measurements"]
+    )
+    click.echo("Values:" if exact else "Values with 95 % intervals:")
     unseen = False
     for row in document["measurements"]:
         tail = f"{words.get(row['name'], '')}{_in_brackets(row.get('standard'))}"
