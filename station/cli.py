@@ -12,14 +12,14 @@ with loading():
 
 COMMANDS = {
     "run": ("station.booth.supervisor:run", "run the whole booth in the foreground"),
-    "start": ("station.booth.operator_cli:start", "start the sensors"),
-    "scan": ("station.booth.operator_cli:scan", "scan the person in the booth"),
+    "start": ("station.booth.operator.sensors_cli:start", "start the sensors"),
+    "scan": ("station.booth.operator.scan_cli:scan", "scan the person in the booth"),
     "cancel": (
-        "station.booth.operator_cli:cancel",
+        "station.booth.operator.sensors_cli:cancel",
         "cancel a scan that has not been reconstructed",
     ),
-    "status": ("station.booth.operator_cli:status", "show cameras, scans and workers"),
-    "stop": ("station.booth.operator_cli:stop", "stop the sensors"),
+    "status": ("station.booth.operator.status_cli:status", "show cameras, scans and workers"),
+    "stop": ("station.booth.operator.sensors_cli:stop", "stop the sensors"),
     "calibrate": (
         "station.calibration.guide.calibrate_cli:calibrate",
         "find where the cameras are",

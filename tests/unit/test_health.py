@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from station.booth import operator_cli
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
+from station.booth.operator import asking, status_cli
 from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
@@ -190,9 +190,9 @@ def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
     def code(*, streaming: bool, silent: Sequence[str] = ()) -> int:
         _problems(config, streaming=streaming, silent=silent, cameras={})
         told = {**asdict(booth_health(config)), "streaming": streaming}
-        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
+        monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=told))
         path = str(config.runtime.folder.parent / "booth.toml")
-        done = CliRunner().invoke(operator_cli.status, ["--json", "--config", path])
+        done = CliRunner().invoke(status_cli.status, ["--json", "--config", path])
         assert answered(done.stdout)
         return done.exit_code
 
@@ -212,10 +212,10 @@ def test_status_says_that_a_process_that_scans_need_is_starting(
         _tell(config, process, started_s=now_s - 1.0)
     _tell(config, "sync", started_s=now_s - 1.0, silent=["b"], cameras={"b": _camera("off")})
     told = {**asdict(booth_health(config)), "streaming": False}
-    monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
+    monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=told))
     path = str(config.runtime.folder.parent / "booth.toml")
-    monkeypatch.setattr(operator_cli, "_show_status", lambda _: None)
-    done = CliRunner().invoke(operator_cli.status, ["--config", path])
+    monkeypatch.setattr(status_cli, "_show_status", lambda _: None)
+    done = CliRunner().invoke(status_cli.status, ["--config", path])
     assert done.exit_code == 1
     assert done.output == "! the booth is starting; try again in a few seconds\n"
 
@@ -228,8 +228,8 @@ def test_status_tells_once_that_the_calibration_is_of_other_cameras(
 
     def shown(told: Sequence[str]) -> str:
         health = {**asdict(booth_health(config)), "streaming": True, "problems": told}
-        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=health))
-        return CliRunner().invoke(operator_cli.status, ["--config", str(path)]).output
+        monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=health))
+        return CliRunner().invoke(status_cli.status, ["--config", str(path)]).output
 
     _problems(config, streaming=True, silent=[], cameras={})
     assert "!" not in shown([])
@@ -342,7 +342,7 @@ def test_cancelled_scans_are_not_said_to_have_failed(config: BoothConfig) -> Non
         bundle.mkdir()
         spool.submit(bundle, scan_id)
         assert spool.withdraw(scan_id_of(scan_id), "torn" if scan_id == "c" else CANCELLED)
-    shown = CliRunner().invoke(operator_cli.status, ["--config", str(path)]).output
+    shown = CliRunner().invoke(status_cli.status, ["--config", str(path)]).output
     assert "spool: 1 failed, 2 cancelled;" in shown
     [scans] = [m for m in BoothCollector(config, path).collect() if m.name == "booth_scans"]
     assert {s.labels["state"]: s.value for s in scans.samples} == {"failed": 1, "cancelled": 2}
@@ -370,8 +370,8 @@ def test_status_shows_framesets_per_second(
     def shown(*, streaming: bool) -> str:
         _problems(config, streaming=streaming, silent=[], cameras={}, framesets_hz=29.97)
         told = {**asdict(booth_health(config)), "streaming": streaming}
-        monkeypatch.setattr(operator_cli, "ask", lambda *_: Reply(ok=True, content=told))
-        return CliRunner().invoke(operator_cli.status, ["--config", path]).output
+        monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=told))
+        return CliRunner().invoke(status_cli.status, ["--config", path]).output
 
     assert "framesets: 30 per second\n" in shown(streaming=True)
     assert "framesets" not in shown(streaming=False)

@@ -16,8 +16,10 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from station.booth import operator_cli
-from station.booth.operator_cli import _follow, cancel, scan, show_result, start, status, stop
+from station.booth.operator import asking, scan_cli
+from station.booth.operator.scan_cli import _follow, scan, show_result
+from station.booth.operator.sensors_cli import cancel, start, stop
+from station.booth.operator.status_cli import status
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import held
@@ -125,8 +127,8 @@ def test_a_reconstruction_counts_its_seconds_on_one_line(
     def answer(*_: object) -> dict[str, Any]:
         return {"state": next(states), "reason": "", "wanted": 0, "framesets": 0}
 
-    monkeypatch.setattr(operator_cli, "_ask_until_answered", answer)
-    monkeypatch.setattr(operator_cli, "time", clock)
+    monkeypatch.setattr(scan_cli, "_ask_until_answered", answer)
+    monkeypatch.setattr(scan_cli, "time", clock)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: watched)
     order = Request("scan", "a")
     with pytest.raises(BoothError, match="is not done yet"):
@@ -150,7 +152,7 @@ def test_a_long_label_is_refused_by_control_and_not_cut_here(
         told.append(order.label)
         raise BoothError("the label has 300 characters")
 
-    monkeypatch.setattr(operator_cli, "_ask_until_answered", refused)
+    monkeypatch.setattr(scan_cli, "_ask_until_answered", refused)
     done = _run(scan, one_camera, "--label", 300 * "x")
     assert str(done.exception) == "the label has 300 characters"
     assert told == [300 * "x"]
@@ -170,7 +172,7 @@ def test_a_station_that_was_just_begun_is_waited_for(
             raise answer
         return answer
 
-    monkeypatch.setattr(operator_cli, "ask_again", asked)
+    monkeypatch.setattr(asking, "ask_again", asked)
     assert str(_run(start, one_camera).exception) == "it answered"
 
 
@@ -189,7 +191,7 @@ def test_a_scan_that_was_accepted_outlives_the_station(
             raise answer
         return answer
 
-    monkeypatch.setattr(operator_cli, "_command", told)
+    monkeypatch.setattr(scan_cli, "command", told)
     order = Request("scan", "a")
     done = _follow(one_camera, order, session, lambda state: state == "delivered", math.inf)
     assert done["state"] == "delivered"
@@ -213,7 +215,7 @@ def test_the_verdict_is_told_whatever_it_is(
 ) -> None:
     """A good one was to be guessed from the lack of words."""
     session = {"state": state, "reason": reason, "wanted": 0, "framesets": 0, "path": ""}
-    monkeypatch.setattr(operator_cli, "_ask_until_answered", lambda *_: session)
+    monkeypatch.setattr(scan_cli, "_ask_until_answered", lambda *_: session)
     done = _run(scan, one_camera)
     assert words in done.output.splitlines()
     assert done.exit_code == code
@@ -233,8 +235,8 @@ def test_a_scan_of_a_booth_that_is_starting_is_not_said_to_be_unsure(
             raise NoAnswerError("control did not answer")
         return next(replies)
 
-    monkeypatch.setattr(operator_cli, "ask", ask)
-    monkeypatch.setattr(operator_cli, "_UNSURE_S", 60.0 if answers else 0.0)
+    monkeypatch.setattr(asking, "ask", ask)
+    monkeypatch.setattr(scan_cli, "_UNSURE_S", 60.0 if answers else 0.0)
     with held(one_camera.runtime.folder / STATION_LOCK, BoothError("held")):
         done = _run(scan, one_camera)
     if answers:
@@ -250,11 +252,11 @@ def test_a_scan_that_control_may_have_received_is_said_to_be_unsure(
     def ask(*_: object) -> Reply:
         raise NoAnswerError("control did not answer")
 
-    monkeypatch.setattr(operator_cli, "ask", ask)
-    monkeypatch.setattr(operator_cli, "_UNSURE_S", 0.0)
+    monkeypatch.setattr(asking, "ask", ask)
+    monkeypatch.setattr(scan_cli, "_UNSURE_S", 0.0)
     with held(one_camera.runtime.folder / "control.lock", BoothError("held")):
         done = _run(scan, one_camera)
-    assert isinstance(done.exception, operator_cli.UnsureError)
+    assert isinstance(done.exception, scan_cli.UnsureError)
 
 
 def test_a_cancelled_scan_is_not_said_to_have_failed(

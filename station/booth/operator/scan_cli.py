@@ -1,27 +1,18 @@
-"""The operator's commands: start, scan, status, stop."""
+"""The operator's command: scan."""
 
 from __future__ import annotations
 
-import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.health import (
-    booth_health,
-    can_scan,
-    reports,
-    scans_by_outcome,
-    starting,
-    unusable,
-)
+from station.booth.operator.asking import STARTS, command
 from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -29,17 +20,13 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
-from station.core.service import NOTHING_RUNS, STATION_LOCK
+from station.core.service import STATION_LOCK
 from station.messaging.messages import Request
-from station.messaging.transport import NoAnswerError, NothingRunsError, ask, ask_again
+from station.messaging.transport import NoAnswerError
 
 _POLL_S = 0.05
-_BEGINS_S = 3.0
-"""Time within which `station run` shows that it runs, on a busy computer."""
-_STARTS = "the booth is starting; try again in a few seconds"
-_NOT_BEGUN = f"{_STARTS}; no scan was started"
+_NOT_BEGUN = f"{STARTS}; no scan was started"
 _EXIT_RESCAN = 3
-_EXIT_NO_SCANS = 1
 _UNSURE_S = 15.0
 """Time within which a process that hangs is restarted and the outcome of a scan is known again."""
 _TIMEOUT = Number(0.0, 86400.0, unit="seconds")
@@ -52,179 +39,6 @@ _WORDS = {
     "reconstructing": "reconstructing",
 }
 _CHANGING = (_WORDS["capturing"], _WORDS["reconstructing"])
-
-
-def _command(config: BoothConfig, request: Request, *, repeats: bool = False) -> dict[str, Any]:
-    runtime = config.runtime
-    asked = ask_again if repeats else ask
-    reply = asked(runtime.folder, "control", request, runtime.command_timeout_s)
-    if not reply.ok:
-        raise BoothError(reply.error)
-    return reply.content
-
-
-@click.command()
-@config_option
-@click.option(
-    "--timeout", "timeout_s", type=_TIMEOUT, default=20.0, help="seconds to wait for all cameras"
-)
-def start(config_path: Path | None, timeout_s: float) -> None:
-    """Start the sensors and wait until every camera sends frames.
-
-    \b
-    Examples:
-      station start
-    """
-    config = load_config(find_config(config_path))
-    _start(config)
-    began_s = time.monotonic()
-    deadline_s = began_s + timeout_s
-    troubles: dict[str, str] = {}
-    while True:
-        sync = _command(config, Request("status"))["sync"]
-        silent = sync.get("silent", [camera.name for camera in config.cameras])
-        # A camera whose process has just died counts as silent only after a while.
-        if not silent and time.monotonic() - began_s > config.sync.silent_after_s:
-            break
-        for name in silent:
-            detail = sync.get("cameras", {}).get(name, {}).get("detail")
-            # Between two attempts a camera reports no detail; its last one still applies.
-            if detail and troubles.get(name) != detail:
-                troubles[name] = detail
-                click.echo(f"  camera {name}: {detail}; trying again", err=True)
-        if time.monotonic() > deadline_s:
-            raise BoothError(
-                "; ".join(f"camera {name}: {troubles.get(name, 'no frames')}" for name in silent)
-            )
-        time.sleep(_POLL_S)
-    count = len(config.cameras)
-    click.echo(f"{count} camera{'s' if count > 1 else ''} streaming")
-
-
-def _start(config: BoothConfig) -> None:
-    """Ask control to start the sensors.
-
-    `station run` may have been begun a moment ago in the same script: it is given the time to show
-    that it runs, and its control process the time to answer.
-    """
-    deadline_s = time.monotonic() + _BEGINS_S
-    while True:
-        try:
-            _command(config, Request("start"), repeats=True)
-            return
-        except NothingRunsError:
-            if time.monotonic() > deadline_s:
-                raise
-            time.sleep(_POLL_S)
-
-
-@click.command()
-@config_option
-def stop(config_path: Path | None) -> None:
-    """Stop the sensors; accepted scans are still reconstructed.
-
-    \b
-    Examples:
-      station stop
-    """
-    config = load_config(find_config(config_path))
-    _command(config, Request("stop"))
-    click.echo("sensors stopped")
-
-
-@click.command()
-@click.argument("scan_id")
-@config_option
-def cancel(scan_id: str, config_path: Path | None) -> None:
-    """Cancel a scan that is being taken or is waiting to be reconstructed.
-
-    \b
-    Examples:
-      station cancel 20261121T100000Z-7f3a
-    """
-    config = load_config(find_config(config_path))
-    session = _command(config, Request("cancel", scan_id))
-    click.echo(f"scan {scan_id}: {session['reason'] or session['state']}")
-
-
-@click.command()
-@config_option
-@click.option("--json", "as_json", is_flag=True, help="print JSON")
-def status(config_path: Path | None, as_json: bool) -> None:
-    """Show processes, cameras, framesets and the spool, and what is wrong with them.
-
-    Exit code 0: scans can be taken, once the sensors are started if they are stopped; 1: they
-    cannot, because the booth does not run, a process that scans need or a camera is silent or
-    disturbed, the disk is full, or the calibration is missing or of other cameras. What is known is
-    shown either way.
-
-    \b
-    Examples:
-      station status
-      station status --json
-    """
-    config = load_config(find_config(config_path))
-    error = None
-    try:
-        content = _command(config, Request("status"))
-    except BoothError as problem:
-        error, content = problem, {**asdict(booth_health(config)), "streaming": None}
-        if starting(content["processes"]):
-            error = BoothError(_STARTS)
-    if as_json:
-        click.echo(json.dumps(content))
-    else:
-        _show_status(content)
-    if error is not None:
-        raise error
-    if not can_scan(config, content):
-        # The station tells it of the booth.toml that it was begun with.
-        words = unusable(config)
-        if not as_json and words and words not in content["problems"]:
-            click.echo(f"! {words}")
-        if not as_json and starting(content["processes"]):
-            click.echo(f"! {_STARTS}")
-        sys.exit(_EXIT_NO_SCANS)
-
-
-def _show_status(content: Mapping[str, Any]) -> None:
-    streaming = content["streaming"]
-    if streaming is not None:
-        click.echo("sensors " + ("started" if streaming else "stopped"))
-    if any(content["processes"].values()):
-        click.echo(f"  {'process':<22} {'state':<10} last report")
-        begun = starting(content["processes"])
-        silent = "SILENT" if any(map(reports, content["processes"].values())) else "stopped"
-        for name, told in content["processes"].items():
-            words = "running" if reports(told) else silent
-            age = f"{told['age_s']:.0f} s ago" if told else "never"
-            if name in begun:
-                words, age = "starting", ""
-            click.echo(f"  {name:<22} {words:<10} {age}".rstrip())
-    cameras = content["sync"].get("cameras", {})
-    if cameras:
-        click.echo(f"  {'camera':<22} {'state':<10} {'frames':>8} {'lost':>6} {'Hz':>5}")
-    for name, camera in cameras.items():
-        # Sensors that were stopped are expected to be silent.
-        unexpectedly_silent = camera["silent"] and streaming
-        words = "silent" if unexpectedly_silent else camera["state"]
-        rate = f"{camera['rate_hz']:.0f}" if camera["rate_hz"] else ""
-        click.echo(
-            f"  {name:<22} {words:<10} {camera['frames']:>8} {camera['lost']:>6} {rate:>5}"
-            + (f"  {camera['detail']}" if camera["detail"] else "")
-        )
-    if streaming and "framesets_hz" in content["sync"]:
-        click.echo(f"framesets: {content['sync']['framesets_hz']:.0f} per second")
-    for name, count in content["processes"].get("deliver", {}).get("waiting", {}).items():
-        click.echo(f"deliver {name}: " + (f"{count} to hand over" if count else "all handed over"))
-    counts = scans_by_outcome(content["spool"], content.get("cancelled", 0))
-    free = f"; {content['free_bytes'] / 1e9:.1f} GB free" if content["free_bytes"] else ""
-    click.echo(
-        f"spool: {', '.join(f'{n} {state}' for state, n in counts.items()) or 'empty'}{free}"
-    )
-    for problem in content["problems"]:
-        if problem != NOTHING_RUNS or content["streaming"] is not None:  # else told as the error
-            click.echo(f"! {problem}")
 
 
 @click.command()
@@ -392,7 +206,7 @@ def _ask_until_answered(
         # An order that nobody could receive is not taken up later: it went with its socket.
         received = received or is_held(lock)
         try:
-            return _command(config, request)
+            return command(config, request)
         except NoAnswerError:
             runs = any(is_held(config.runtime.folder / lock) for lock in _LOCKS)
             if not (told or line or runs):
