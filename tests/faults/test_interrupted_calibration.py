@@ -9,10 +9,10 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
+from ctrl_c import heard
 
 from station.calibration.detect.step_names import BALL, EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, Session
@@ -102,8 +102,7 @@ def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None
     waving = subprocess.Popen(
         _command(config, recordings),
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        # A shell that runs the tests in the background ignores Ctrl-C on behalf of all.
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=heard,
     )  # fmt: skip
     deadline_s = time.monotonic() + 120.0
     journal = folder / JOURNAL

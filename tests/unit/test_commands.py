@@ -1,5 +1,6 @@
 import importlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from ctrl_c import heard
 
 from station import cli as station_cli
 from station.core.commands import LazyGroup, Number, run
@@ -210,6 +212,7 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=heard,
     ) as rendering:
         deadline_s = time.monotonic() + 60.0
         while not list(out.glob("*/d-*.pgm")):
@@ -218,10 +221,9 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
         os.killpg(rendering.pid, signal.SIGINT)
         _, told = rendering.communicate(timeout=60.0)
     assert rendering.returncode == 130
-    assert told == (
-        f"stopped; {out} is incomplete (0 of 4 recordings): delete it before you record there "
-        "again\n"
-    )
+    told, count = re.subn(r"\([0-3] of 4 recordings\)", "(some)", told)
+    assert count == 1
+    assert told == f"stopped; {out} is incomplete (some): delete it before you record there again\n"
 
 
 @pytest.mark.parametrize(
@@ -252,6 +254,7 @@ def test_a_command_that_is_interrupted_while_it_loads_is_silent(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=heard,
     ) as starting:
         assert starting.stdout is not None
         assert starting.stdout.readline() == "loads\n"
