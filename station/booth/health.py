@@ -152,8 +152,7 @@ def unusable(config: BoothConfig) -> str:
     """Words on a calibration that no scan can be taken with; empty if it is sound."""
     path = config.calibration
     try:
-        file = path.stat()
-        calibrated = _calibrated(path, (file.st_ino, file.st_mtime_ns, file.st_size))
+        calibrated = _calibrated(path, _version(path))
     except FileNotFoundError:
         return "the booth is not calibrated, and takes no scans: run station calibrate"
     except (BoothError, OSError) as error:
@@ -161,8 +160,17 @@ def unusable(config: BoothConfig) -> str:
     return mismatch(calibrated, configured_serials(config.cameras))
 
 
+_Version = tuple[int, int, int]
+
+
+def _version(path: Path) -> _Version:
+    """Inode, time and size of a file, which tell whether it has to be read again."""
+    file = path.stat()
+    return file.st_ino, file.st_mtime_ns, file.st_size
+
+
 @lru_cache(maxsize=1)
-def _calibrated(path: Path, version: tuple[int, int, int]) -> dict[str, str]:  # noqa: ARG001
+def _calibrated(path: Path, version: _Version) -> dict[str, str]:  # noqa: ARG001
     """Cameras of a calibration and their serial numbers.
 
     Asked for every second, and read only when the file is another version of it.
@@ -173,14 +181,13 @@ def _calibrated(path: Path, version: tuple[int, int, int]) -> dict[str, str]:  #
 def _changed(path: Path, config: BoothConfig) -> bool:
     """Whether a booth.toml says something else than the booth that runs goes by."""
     try:
-        file = path.stat()
-        return _read(path, (file.st_ino, file.st_mtime_ns, file.st_size)) != config
+        return _read(path, _version(path)) != config
     except (BoothError, OSError):
         return True
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, version: tuple[int, int, int]) -> BoothConfig:  # noqa: ARG001
+def _read(path: Path, version: _Version) -> BoothConfig:  # noqa: ARG001
     """A booth.toml, read only when the file is another version of it."""
     return load_config(path)
 
