@@ -52,10 +52,11 @@ def test_a_booth_that_takes_no_scans_says_so(console: LiveConsole) -> None:
         log_in(page, console)
         open_view(page, console, "scan")
         troubles = page.locator("#troubles")
-        expect(page.locator("#go")).to_be_visible(timeout=LONG_MS)
+        expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
         calibration.rename(away)
         try:
             expect(troubles).to_contain_text("is not calibrated", timeout=LONG_MS)
+            expect(page.locator("#go")).to_be_disabled(timeout=LONG_MS)
             told = client.get("/booth").json()
             assert not told["can_scan"]
             assert any("is not calibrated" in problem for problem in told["problems"])
@@ -67,3 +68,5 @@ def test_a_booth_that_takes_no_scans_says_so(console: LiveConsole) -> None:
         finally:
             away.rename(calibration)
         expect(troubles).not_to_contain_text("扫描室尚未校准", timeout=LONG_MS)
+        open_view(page, console, "scan")
+        expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)

@@ -24,6 +24,8 @@ export async function scan(main, session) {
   cameras.onpresence = (somebody) => { presence.textContent = t(somebody ? 'scan.somebody' : 'scan.nobody'); };
   const stage = h('section', { className: 'card stage', id: 'stage', 'aria-live': 'polite' });
   let streaming = state.streaming;
+  let able = state.can_scan;
+  let asked = false;
   let label = '';
   let current = null;
   let pressed = 0;
@@ -41,7 +43,15 @@ export async function scan(main, session) {
       : h('div', {}, h('p', {}, t('scan.needSensors')), h('button', { id: 'sensors', onclick: sensors }, t('booth.start')));
     stage.replaceChildren(
       h('div', { className: 'label' }, h('label', { htmlFor: 'label' }, t('scan.label')), input),
-      h('button', { className: 'big primary', id: 'go', disabled: !streaming, onclick: begin }, t('scan.go')), help);
+      h('button', { className: 'big primary', id: 'go', onclick: begin }, t('scan.go')), help);
+    allow();
+  }
+
+  // A press that the booth would refuse is not offered; the banner says what is in the way.
+  function allow() {
+    for (const button of stage.querySelectorAll('#go, #again')) {
+      button.disabled = asked || !streaming || !able;
+    }
   }
 
   async function sensors(event) {
@@ -54,12 +64,18 @@ export async function scan(main, session) {
   }
 
   async function begin() {
+    // The label's Enter comes here too.
+    if (document.getElementById('go').disabled) return;
     pressed = performance.now();
-    document.getElementById('go').disabled = true;
+    asked = true;
+    allow();
     try {
       const body = { label: label.trim(), countdown_s: session.countdown_s };
-      follow(await post('/scans', body, { 'Idempotency-Key': freshKey() }));
+      const found = await post('/scans', body, { 'Idempotency-Key': freshKey() });
+      asked = false;
+      follow(found);
     } catch (error) {
+      asked = false;
       notice(error.message, true);
       ready();
     }
@@ -149,7 +165,6 @@ export async function scan(main, session) {
     const cancelled = outcome(done) === 'cancelled';
     const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
     const again = h('button', { id: 'again', className: look === 'ok' ? '' : 'primary', onclick: begin }, t('scan.again'));
-    again.addEventListener('click', () => { again.disabled = true; });
     stage.replaceChildren(
       done.state === 'failed' ? '' : h('p', { className: 'leave', id: 'leave' }, t('scan.leave')),
       h('div', { className: `verdict ${look}`, id: 'verdict', 'data-verdict': look },
@@ -162,6 +177,7 @@ export async function scan(main, session) {
         again,
         h('button', { id: 'next', onclick: () => { label = ''; ready(); document.getElementById('label').focus(); } }, t('scan.next'))),
       h('button', { id: 'go', hidden: true }));
+    allow();
     if (done.state !== 'failed') mark(done, figure);
     latest();
   }
@@ -176,7 +192,12 @@ export async function scan(main, session) {
   }
 
   async function look() {
-    try { showTroubles(await get('/booth')); } catch { /* the connection's loss is told elsewhere */ }
+    try {
+      const told = await get('/booth');
+      showTroubles(told);
+      able = told.can_scan;
+      allow();
+    } catch { /* the connection's loss is told elsewhere */ }
   }
 
   const silence = listen((kind, data) => {
@@ -185,6 +206,7 @@ export async function scan(main, session) {
     if (kind === 'framesets' && data.streaming !== streaming) {
       streaming = data.streaming;
       if (!current) ready();
+      else allow();
     }
     if (!current || data.scan_id !== current.scan_id) return;
     if (kind === 'scan' && data.state !== 'deleted') {
