@@ -121,9 +121,10 @@ $(VENV)/dev.stamp: $(VENV)/system.stamp pyproject.toml
 	$(PIP) --editable '.[dev,simulation]'
 	touch $@ $(VENV)/runtime.stamp
 
-$(VENV)/train.stamp: $(VENV)/dev.stamp pyproject.toml
-	$(PIP) 'torch==2.13.0' --editable '.[dev,train,simulation]'
-	touch $@
+# All at once: a second installation would look at each package again.
+$(VENV)/train.stamp: $(VENV)/system.stamp pyproject.toml
+	$(PIP) --editable '.[dev,train,simulation]'
+	touch $@ $(VENV)/dev.stamp $(VENV)/runtime.stamp
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info
