@@ -88,6 +88,17 @@ class LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         return command
 
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (KeyboardInterrupt, click.Abort) as cause:
+            # A question whose answers ended is aborted as well, and click says so.
+            if isinstance(cause, click.Abort) and not isinstance(
+                cause.__context__, KeyboardInterrupt
+            ):
+                raise
+            raise _Ended(signal.SIGINT) from None
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the table's own help lines: no subcommand is imported for it."""
         del ctx
@@ -111,29 +122,32 @@ def writable_folder(folder: Path, option: str, mode: int = 0o777) -> None:
         ) from None
 
 
-class _Terminated(SystemExit):
-    """SIGTERM was received."""
+class _Ended(SystemExit):
+    """A signal, whose number is the code, ended the command."""
+
+    code: signal.Signals
 
 
 def _terminate(*_: object) -> None:
     # A second signal must not end what cleans up after the first.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise _Terminated
+    raise _Ended(signal.SIGTERM)
 
 
 def run(group: click.Group) -> None:
     """Call a command; an error that the user can act upon becomes one line and exit code 1.
 
-    SIGTERM ends it as it would by default, once folders that were made for its time are gone.
-    Processes that run until they are stopped handle it themselves.
+    SIGTERM and Ctrl-C end it as they would by default, without a word of its own, once folders that
+    were made for its time are gone. Processes that run until they are stopped handle them
+    themselves.
     """
     set_up_caches()
     signal.signal(signal.SIGTERM, _terminate)
     try:
         group()
-    except _Terminated:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGTERM)
+    except _Ended as ended:
+        signal.signal(ended.code, signal.SIG_DFL)
+        os.kill(os.getpid(), ended.code)
     except BoothError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)

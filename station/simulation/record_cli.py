@@ -32,8 +32,6 @@ HEADING = "# A virtual booth: four replayed Kinects."
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error if a calibration is recorded."""
 _PROCESSES = 2
-_INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended, as in a shell."""
 
 
 _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
@@ -182,7 +180,6 @@ def _render(jobs: Mapping[str, Callable[[], int]], folder: Path) -> None:
                 "before you record there again",
                 err=True,
             )
-            raise SystemExit(_INTERRUPTED) from None
         raise
     finally:
         # Waited for: the pool's semaphores are released, which outlive the process otherwise.

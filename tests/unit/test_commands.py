@@ -220,7 +220,7 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
             time.sleep(0.05)
         os.killpg(rendering.pid, signal.SIGINT)
         _, told = rendering.communicate(timeout=60.0)
-    assert rendering.returncode == 130
+    assert rendering.returncode == -signal.SIGINT
     told, count = re.subn(r"\([0-3] of 4 recordings\)", "(some)", told)
     assert count == 1
     assert told == f"stopped; {out} is incomplete (some): delete it before you record there again\n"
@@ -262,6 +262,31 @@ def test_a_command_that_is_interrupted_while_it_loads_is_silent(
         assert starting.communicate(timeout=20.0) == ("", "")
     # 130 in a shell.
     assert starting.returncode == -signal.SIGINT
+
+
+@pytest.mark.parametrize("waits", ["time.sleep(60)", "click.confirm('Delete?')"])
+def test_a_command_that_is_interrupted_is_silent(tmp_path: Path, waits: str) -> None:
+    """Most ended with "Aborted!" and 1, as if something had failed."""
+    source = (
+        f"import click, time\n@click.command\ndef it():\n    click.echo('works')\n    {waits}\n"
+    )
+    (tmp_path / "slow.py").write_text(source)
+    group = "run(LazyGroup(lazy={'it': ('slow:it', '')}))"
+    with subprocess.Popen(
+        [sys.executable, "-c", f"from station.core.commands import *; {group}", "it"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heard,
+    ) as working:
+        assert working.stdout is not None
+        assert working.stdout.readline() == "works\n"
+        time.sleep(0.5)
+        working.send_signal(signal.SIGINT)
+        assert working.communicate(timeout=20.0)[1] == ""
+    assert working.returncode == -signal.SIGINT
 
 
 def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:

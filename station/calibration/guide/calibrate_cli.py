@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 
 _SIDE = Number(0.001, 1.0, unit="metres")
-_INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended, as in a shell."""
 
 
 def _options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,10 +47,7 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
                 step = context.invoked_subcommand
                 raise click.UsageError(f"put options after the step: station calibrate {step} ...")
             return None
-        try:
-            return _called(command, args, kwargs, config_path, recordings, yes)
-        except (KeyboardInterrupt, click.Abort):
-            raise SystemExit(_INTERRUPTED) from None
+        return _called(command, args, kwargs, config_path, recordings, yes)
 
     return wrapped
 
