@@ -110,7 +110,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """All cameras of a booth in one world frame (z up, floor z = 0, the subject faces -y)."""
+    """All cameras of a booth in one world frame (z up, floor z = 0, the person faces -y)."""
 
     created: str
     """UTC, ISO 8601."""

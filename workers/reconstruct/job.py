@@ -59,7 +59,7 @@ class JobSummary:
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
     evidence: Mapping[str, Any] | None = None
-    """Document of format "booth-camera-evidence" of a scan that is accepted."""
+    """Document of format "booth-camera-evidence" of a scan that is "ok"."""
 
 
 def warm_up() -> BodyModel:

@@ -46,8 +46,8 @@ _EXIT_CHANGED = 4
 def check(config_path: Path | None, recordings: Path | None, as_json: bool, correct: bool) -> None:
     """Compare the empty booth with what was stored when it was calibrated.
 
-    Exit code 0: every camera stands where it did; 3: one has moved, calibrate again; 4: the booth
-    looks too different to tell, put it in order and check again.
+    Exit code 0: every camera stands where it did; 3: one has moved, or no longer sees what it saw;
+    4: the booth looks too different to tell, put it in order and check again.
 
     With --correct: where the scans of the last people say that a camera has drifted, store and use
     a corrected calibration, provided that it also fits people whom it was not computed from.

@@ -102,7 +102,7 @@ def _step(command: Callable[..., None]) -> Callable[..., Any]:
 @click.option("--new", is_flag=True, help="start over; the unfinished calibration is abandoned")
 @_options
 def calibrate(procedure: Procedure, use_name: str | None, list_them: bool, new: bool) -> None:
-    """Find where the cameras are: empty booth, waved ball, mark and floor, then the solution.
+    """Find where the cameras are: empty booth, ball waved, laid down and raised, board, solution.
 
     Without a step all of them are done, guided, from where the last attempt ended. A step by itself
     adds to the calibration that is being done, or else to the one in use (floor begins another);

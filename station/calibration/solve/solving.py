@@ -58,7 +58,7 @@ def solve(
     """The calibration that agrees best with all that was seen.
 
     ``cameras`` give lens and serial; their poses and corrections are not used. ``front_cameras``
-    stand in front of the subject: they give the heading where the ball was not put in front of the
+    stand in front of the person: they give the heading where the ball was not put in front of the
     mark.
 
     Raises:

@@ -1,6 +1,6 @@
 """The transform from the reference camera to the booth: z up from the floor, origin on the mark.
 
-The subject faces -y: towards where the ball rested in front of the mark, or else towards the middle
+The person faces -y: towards where the ball rested in front of the mark, or else towards the middle
 of the front cameras.
 """
 
