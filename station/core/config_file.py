@@ -142,8 +142,10 @@ def _first_problem(cause: ValidationError, model: type[Strict], place: _Place) -
         return f"{key} is missing; add it"
     if problem["type"] == "tuple_type" and isinstance(problem["input"], dict):
         return f"{key}: there can be several; write [[{key}]]"
-    said = _MUST.get(problem["type"], problem["msg"]).format(**problem.get("ctx", {}))
-    said = said.removeprefix("Value error, ").replace("Input should", "must")
+    if problem["type"] in _MUST:
+        said = _MUST[problem["type"]].format(**problem.get("ctx", {}))
+    else:
+        said = problem["msg"].removeprefix("Value error, ").replace("Input should", "must")
     # The key says already which section is meant.
     found = "" if isinstance(problem["input"], dict | Strict) else _found(problem["input"])
     return f"{key}: {said}{found}" if key else f"{said}{found}"
