@@ -119,17 +119,25 @@ class HandOver:
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
-            after = entry.failed(str(error), now_s)
-            self._ledger.keep(after)
-            self._log.warning(
-                "%s not handed over to %s (%s); retrying in %.0f s",
-                entry.scan_id, entry.target, error, after.next_s - now_s,
-                extra={"scan": entry.scan_id},
-            )  # fmt: skip
+            self._postpone(entry, str(error), now_s)
+            return
+        except Exception as error:
+            # One result that is damaged must not keep the others from being handed over.
+            self._log.exception("handing over %s", entry.scan_id, extra={"scan": entry.scan_id})
+            self._postpone(entry, f"{type(error).__name__}: {error}", now_s)
             return
         self._ledger.finish(entry)
         words = "%s handed over to %s"
         self._log.info(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
+
+    def _postpone(self, entry: Waiting, reason: str, now_s: float) -> None:
+        after = entry.failed(reason, now_s)
+        self._ledger.keep(after)
+        self._log.warning(
+            "%s not handed over to %s (%s); retrying in %.0f s",
+            entry.scan_id, entry.target, reason, after.next_s - now_s,
+            extra={"scan": entry.scan_id},
+        )  # fmt: skip
 
 
 @click.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import http.client
 import json
 import shutil
 import time
@@ -51,12 +52,13 @@ class FolderTarget:
 
     def __call__(self, scan: ScanRecord, result: Path) -> None:
         final = self._folder / scan.scan_id
-        if final.exists():
-            return
-        if not self._folder.is_dir():
-            raise HandOverError(f"{self._folder} does not exist; is the share mounted?")
         beside = self._folder / f".{scan.scan_id}.part"
         try:
+            # A share whose server is down refuses even these.
+            if final.exists():
+                return
+            if not self._folder.is_dir():
+                raise HandOverError(f"{self._folder} does not exist; is the share mounted?")
             if beside.exists():
                 shutil.rmtree(beside)
             shutil.copytree(result, beside)
@@ -112,8 +114,9 @@ class WebhookTarget:
                 pass
         except urllib.error.HTTPError as cause:
             raise HandOverError(f"{self._url} answers {cause.code}") from None
-        except (OSError, ValueError) as cause:
-            reason = getattr(cause, "reason", cause)
+        except (OSError, ValueError, http.client.HTTPException) as cause:
+            # What is no HTTP is neither an OSError nor a ValueError.
+            reason = str(getattr(cause, "reason", cause)).strip()
             raise HandOverError(f"{self._url}: {reason}") from None
 
     def signature(self, body: bytes, seconds: int) -> str:
