@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -249,6 +250,15 @@ def _count_cancelled(failed: Path, changed_ns: int, count: int) -> int:  # noqa:
     return sum(failure_reason(folder) == CANCELLED for folder in failed.iterdir())
 
 
+def _entries(folder: Path) -> dict[str, os.stat_result]:
+    """What lies in a folder of the spool; what leaves it at this moment is left out."""
+    found = {}
+    for entry in folder.iterdir():
+        with suppress(FileNotFoundError):
+            found[entry.name] = entry.stat()
+    return found
+
+
 def _is_full(config: BoothConfig, free_bytes: int) -> bool:
     """Whether scans are refused for the space that is left."""
     return free_bytes < config.spool.min_free_mb * 1e6
@@ -262,13 +272,10 @@ def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], flo
     try:
         counts = count_scans(folder)
         now_s = time.time()
-        waiting = [now_s - entry.stat().st_mtime for entry in (folder / "queue").iterdir()]
+        waiting = [now_s - found.st_mtime for found in _entries(folder / "queue").values()]
         limit_s = config.workers.timeout_s + _STUCK_S
-        stuck = [
-            entry.name
-            for entry in (folder / "work").iterdir()
-            if now_s - entry.stat().st_ctime > limit_s
-        ]
+        claimed = _entries(folder / "work")
+        stuck = [name for name, found in claimed.items() if now_s - found.st_ctime > limit_s]
         free = shutil.disk_usage(folder).free
     except OSError as error:
         problems.append(f"the spool cannot be read ({error}); check its disk")

@@ -351,6 +351,17 @@ def test_cancelled_scans_are_not_said_to_have_failed(config: BoothConfig) -> Non
     assert booth_health(config).cancelled == 2
 
 
+def test_a_scan_that_moves_on_while_it_is_looked_at_is_no_fault(config: BoothConfig) -> None:
+    """The disk was said to be unreadable and full, for as long as a worker took to claim a scan.
+    A link that leads nowhere is listed and is not there, as such a scan."""
+    spool = Spool(config.spool.folder)
+    spool.path("queue", "a").symlink_to("/nowhere")
+    spool.path("work", "a").symlink_to("/nowhere")
+    health = booth_health(config)
+    assert not [problem for problem in health.problems if "disk" in problem]
+    assert health.free_bytes > 0
+
+
 def test_a_console_that_only_starts_is_not_in_the_way_of_scans(config: BoothConfig) -> None:
     """Status ended with 1 for it, and said nothing."""
     shown = config.console.model_copy(update={"enabled": True})
