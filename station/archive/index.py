@@ -19,7 +19,6 @@ from pathlib import Path
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
 from station.core.files import private_file
-from station.core.scans import CANCELLED
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -105,47 +104,44 @@ class ScanIndex:
             f"SELECT {_COLUMNS} FROM scans WHERE {' AND '.join(where)} "
             "ORDER BY created DESC, scan_id DESC LIMIT ?"
         )
-        with self._open() as database:
-            self._refresh(database)
-            return [_record(row) for row in database.execute(query, [*values, limit])]
+        return [_record(row) for row in self._rows(query, *values, limit)]
 
     def get(self, scan_id: str) -> ScanRecord | None:
         """One scan, or None if no folder of the spool holds it."""
-        with self._open() as database:
-            self._refresh(database)
-            query = f"SELECT {_COLUMNS} FROM scans WHERE scan_id = ?"
-            row = database.execute(query, [scan_id]).fetchone()
-        return None if row is None else _record(row)
+        rows = self._rows(f"SELECT {_COLUMNS} FROM scans WHERE scan_id = ?", scan_id)
+        return _record(rows[0]) if rows else None
 
-    def count_failed(self) -> tuple[int, int]:
-        """Number of scans that failed, and of scans that the operator cancelled."""
-        query = "SELECT reasons = ?, count(*) FROM scans WHERE state = 'failed' GROUP BY 1"
-        with self._open() as database:
-            self._refresh(database)
-            counts = dict(database.execute(query, [json.dumps([CANCELLED])]))
-        return counts.get(0, 0), counts.get(1, 0)
+    def ids_of(self, label: str) -> list[str]:
+        """Ids of all scans with exactly this label, however many they are."""
+        query = "SELECT scan_id FROM scans WHERE label = ? ORDER BY scan_id"
+        return [row[0] for row in self._rows(query, label)]
 
-    @contextmanager
-    def _open(self) -> Iterator[sqlite3.Connection]:
+    def _rows(self, query: str, *values: str | int) -> list[tuple[str, ...]]:
+        """Answer of the database, brought up to date with the folders.
+
+        Raises:
+            IndexBusyError: it cannot be used at the moment.
+        """
         try:
-            with closing(self._connected()) as database:
-                yield database
+            try:
+                return self._fresh_rows(query, values)
+            except sqlite3.OperationalError:
+                # Locked for long, or a busy disk: others are at work in a sound file.
+                raise
+            except sqlite3.DatabaseError:
+                # Damaged, or not this program's: its contents are rebuilt from the folders.
+                for suffix in ("", "-wal", "-shm"):
+                    Path(f"{self._path}{suffix}").unlink(missing_ok=True)
+                return self._fresh_rows(query, values)
         except sqlite3.OperationalError as error:
             raise IndexBusyError(
                 f"the index of scans cannot be used ({error}); try again"
             ) from None
 
-    def _connected(self) -> sqlite3.Connection:
-        try:
-            return self._connect()
-        except sqlite3.OperationalError:
-            # Locked for long, or a busy disk: others are at work in a sound file.
-            raise
-        except sqlite3.DatabaseError:
-            # Damaged, or not this program's: its contents are rebuilt from the folders.
-            for suffix in ("", "-wal", "-shm"):
-                Path(f"{self._path}{suffix}").unlink(missing_ok=True)
-            return self._connect()
+    def _fresh_rows(self, query: str, values: Sequence[str | int]) -> list[tuple[str, ...]]:
+        with closing(self._connect()) as database:
+            self._refresh(database)
+            return database.execute(query, values).fetchall()
 
     def _connect(self, *, shared: bool = False) -> sqlite3.Connection:
         try:

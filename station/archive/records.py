@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from station.core.files import MAX_JSON_BYTES, read_bounded_json
 from station.core.scans import CANCELLED, REASON, ScanId
 from station.core.spool import Spool
 
@@ -63,18 +63,18 @@ def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
         bundle = {} if "label" in result else _read(spool.path("done", scan_id) / "bundle.json")
         origin = {**bundle, **result}
         state: ScanState = "rescan" if result.get("status") == "rescan" else "delivered"
-        reasons = tuple(str(reason) for reason in result.get("reasons", ()))
-        seconds = {str(k): float(v) for k, v in result.get("seconds", {}).items()}
+        reasons = _reasons(result.get("reasons"))
+        seconds = _seconds(result.get("seconds"))
     else:
         origin, state, seconds = _read(folder / "bundle.json"), PLACES[place], {}
         reason = _read(folder / REASON).get("reason")
-        reasons = (str(reason),) if state == "failed" and reason else ()
+        reasons = (_text(reason),) if state == "failed" and reason else ()
     return ScanRecord(
         scan_id=scan_id,
         state=state,
-        label=str(origin.get("label", "")),
-        booth=str(origin.get("booth", "")),
-        created=str(origin.get("created", "")) or moment_of(scan_id) or changed,
+        label=_text(origin.get("label", "")),
+        booth=_text(origin.get("booth", "")),
+        created=_text(origin.get("created", "")) or moment_of(scan_id) or changed,
         finished=changed if place in ("outbox", "failed") else "",
         reasons=reasons,
         seconds=seconds,
@@ -120,9 +120,25 @@ def _moment(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
+def _text(value: object) -> str:
+    """Text that any file can hold: JSON may escape half of a UTF-16 pair."""
+    return str(value).encode("utf-8", "replace").decode()
+
+
+def _reasons(found: object) -> tuple[str, ...]:
+    return tuple(map(_text, found)) if isinstance(found, list) else ()
+
+
+def _seconds(found: object) -> dict[str, float]:
+    steps = found.items() if isinstance(found, dict) else ()
+    return {_text(name): value for name, value in steps if isinstance(value, float)}
+
+
 def _read(path: Path) -> dict[str, Any]:
+    """A JSON document of a scan; empty if there is none, or it is damaged: of one damaged scan the
+    others are listed."""
     try:
-        document = json.loads(path.read_bytes())
+        document = read_bounded_json(path, MAX_JSON_BYTES)
     except (OSError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}

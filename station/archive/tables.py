@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any, Literal
 
 from station.archive.records import ScanRecord
 from station.core.errors import FormatError
+from station.core.files import MAX_JSON_BYTES, read_bounded_json
 from station.core.words.terms import Language, plain_name, split_side
 
 Unit = Literal["cm", "in", "m"]
@@ -48,7 +48,7 @@ def read_measurements(folder: Path, pose: Pose) -> dict[str, Any]:
     """
     path = folder / FILES[pose]
     try:
-        document = json.loads(path.read_bytes())
+        document = read_bounded_json(path, MAX_JSON_BYTES)
     except OSError:
         raise FormatError(f"{folder.name} has no {path.name}; scan again") from None
     except ValueError as cause:

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 import stat
 import time
 import uuid
@@ -136,6 +137,18 @@ def entries_of(folder: Path) -> list[Path]:
         return sorted(folder.iterdir())
     except FileNotFoundError:
         return []
+
+
+def delete(path: Path) -> None:
+    """Remove a file, a link (not what it leads to), or a folder with its contents.
+
+    Raises:
+        OSError: it is not there, or the disk refuses.
+    """
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def read_regular(path: Path, most_bytes: int) -> bytes:

@@ -36,6 +36,7 @@ from typing import Any, Literal, NewType, get_args
 
 from station.core.errors import InputError, SpoolError
 from station.core.files import (
+    delete,
     entries_of,
     private_folder,
     publish_folder,
@@ -45,7 +46,8 @@ from station.core.files import (
 
 ScanId = NewType("ScanId", str)
 """A scan's id: 1 to 64 letters, digits, '-' and '_'. It names folders, so nothing else may."""
-_SCAN_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+SCAN_ID = r"[A-Za-z0-9_-]{1,64}"
+_SCAN_ID = re.compile(SCAN_ID)
 _MAX_NOTE_BYTES = 1 << 16
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -186,13 +188,14 @@ class ScanFolders:
         return self.folder / "tmp" / f"{name}.{os.getpid()}.{time.monotonic_ns()}"
 
     def remove(self, folder: Path) -> None:
-        """Delete a folder: it leaves its place at once, so that nobody finds a part of it there.
+        """Delete a folder, or what else lies in its place: it leaves that at once, so that nobody
+        finds a part of it there.
 
         What an interruption leaves is removed by the next sweep.
         """
         gone = self.temporary(folder.name if is_scan_id(folder.name) else "removed")
         os.rename(folder, gone)
-        shutil.rmtree(gone)
+        delete(gone)
 
     def check_space(self, min_free_mb: float) -> None:
         """Refuse a scan before it is taken, rather than lose it after.

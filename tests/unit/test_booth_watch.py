@@ -8,12 +8,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
 
+from station.booth.health import booth_health
 from station.console.live import watch as watch_module
 from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog
@@ -67,7 +69,9 @@ def test_changes_of_folders_are_told(tmp_path: Path) -> None:
     changes.close()
 
 
-def test_a_cancelled_scan_does_not_count_as_failed(watch: tuple[Watch, EventLog]) -> None:
+def test_a_cancelled_scan_does_not_count_as_failed(
+    watch: tuple[Watch, EventLog], monkeypatch: pytest.MonkeyPatch
+) -> None:
     watching, _ = watch
     spool = Spool(watching._config.spool.folder)
     for scan_id in ("a", "b", "c"):
@@ -77,11 +81,16 @@ def test_a_cancelled_scan_does_not_count_as_failed(watch: tuple[Watch, EventLog]
     assert spool.withdraw(scan_id_of("a"), CANCELLED)
     assert spool.withdraw(scan_id_of("b"), "the bundle is torn")
 
-    def counts() -> tuple[int, int]:
-        booth = watching.booth()
-        return booth["failed"], booth["cancelled"]
+    def told(*_: object) -> dict[str, Any]:
+        return {**asdict(booth_health(watching._config)), "streaming": True}
 
-    _until(lambda: counts() == (1, 1))
+    monkeypatch.setattr(watch_module, "command", told)
+
+    def counts() -> tuple[int, int, int]:
+        booth = watching.booth()
+        return booth["failed"], booth["cancelled"], booth["spool"]["failed"]
+
+    _until(lambda: counts() == (1, 1, 2))
 
 
 def test_what_status_says_is_said_by_the_console(

@@ -26,6 +26,7 @@ from station.console.security.audit import AuditLog
 from station.console.security.throttle import AT_ONCE, LoginThrottle
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.config import BoothConfig
+from station.core.scans import SCAN_ID
 from station.core.service import Heartbeat
 from station.core.spool import Spool
 
@@ -171,8 +172,7 @@ Booth = Annotated[Console, Depends(_console)]
 Reader = Annotated[Caller, Depends(need("read"))]
 Scanner = Annotated[Caller, Depends(need("scan"))]
 Manager = Annotated[Caller, Depends(need("manage"))]
-SCAN_ID = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,79}$"
-ScanId = Annotated[str, PathParameter(pattern=SCAN_ID, examples=["20261121T100000Z-7f3a"])]
+ScanId = Annotated[str, PathParameter(pattern=f"^{SCAN_ID}$", examples=["20261121T100000Z-7f3a"])]
 IdempotencyKey = Annotated[
     str | None,
     Header(

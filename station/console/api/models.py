@@ -6,10 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from station.booth.session import MAX_LABEL_LENGTH
+
 State = Literal[
     "countdown", "armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"
 ]
-Label = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Label = Annotated[
+    str, StringConstraints(max_length=MAX_LABEL_LENGTH, pattern=r"^[^\x00-\x1f\x7f]*$")
+]
 
 
 class _Strict(BaseModel):

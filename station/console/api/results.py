@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +18,12 @@ from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
 from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows, side_differences
-from station.console.api.console import SCAN_ID, Booth, Caller, Console, Reader, ScanId
+from station.console.api.console import Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
 from station.console.api.problems import ProblemError, responses
 from station.console.api.scans import of_record
 from station.core.errors import FormatError
+from station.core.files import MAX_JSON_BYTES, read_bounded_json
 from station.core.words.terms import Language
 
 router = APIRouter(prefix="/scans/{scan_id}", tags=["results"])
@@ -233,13 +233,10 @@ def all_files(
     return _attached(content, "application/zip", f"{scan_id}.zip")
 
 
-Other = Annotated[str, PathParameter(pattern=SCAN_ID)]
-
-
 @router.get("/comparison/{other}", responses=responses(404, 409))
 def comparison(
     scan_id: ScanId,
-    other: Other,
+    other: ScanId,
     console: Booth,
     caller: Reader,
     pose: PoseQuery = "as-scanned",
@@ -271,7 +268,9 @@ def comparison(
         "where the other body is larger",
     ),
 )
-def comparison_distances(scan_id: ScanId, other: Other, console: Booth, caller: Reader) -> Response:
+def comparison_distances(
+    scan_id: ScanId, other: ScanId, console: Booth, caller: Reader
+) -> Response:
     """The distance map of the two surfaces."""
     _, folder = _open(console, caller, scan_id, "comparison")
     _, other_folder = _open(console, caller, other, "comparison")
@@ -281,7 +280,7 @@ def comparison_distances(scan_id: ScanId, other: Other, console: Booth, caller: 
 
 def _result(folder: Path) -> dict[str, Any]:
     try:
-        document = json.loads((folder / "result.json").read_bytes())
+        document = read_bounded_json(folder / "result.json", MAX_JSON_BYTES)
     except (OSError, ValueError):
         raise FormatError(f"the result of {folder.name} is damaged; scan again") from None
     return dict(document)

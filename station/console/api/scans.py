@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query
 
 from station.archive.records import ScanRecord, ScanState, read_noted
 from station.booth.retention import purge_scan
+from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import (
     Booth,
     Console,
@@ -29,7 +30,6 @@ from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
 _ON_DISK = ("accepted", "reconstructing", "delivered", "rescan")
-_MAX_LABEL_LENGTH = 1000
 _TAKEN_UP_S = 60.0
 """A scan that nobody knows of so long after it was asked for was deleted, or refused."""
 
@@ -38,8 +38,12 @@ _TAKEN_UP_S = 60.0
 def list_scans(
     console: Booth,
     caller: Reader,  # noqa: ARG001
-    text: Annotated[str, Query(max_length=200, description="what label or id contains")] = "",
-    label: Annotated[str | None, Query(max_length=200, description="the whole label")] = None,
+    text: Annotated[
+        str, Query(max_length=MAX_LABEL_LENGTH, description="what label or id contains")
+    ] = "",
+    label: Annotated[
+        str | None, Query(max_length=MAX_LABEL_LENGTH, description="the whole label")
+    ] = None,
     since: Annotated[str, Query(max_length=40, description="ISO 8601, UTC")] = "",
     until: Annotated[str, Query(max_length=40, description="ISO 8601, UTC, excluded")] = "",
     state: Annotated[
@@ -146,18 +150,20 @@ def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
 
 @router.delete("", responses=responses(404, 409))
 def delete_label(
-    label: Annotated[str, Query(min_length=1, max_length=200, description="the whole label")],
+    label: Annotated[
+        str, Query(min_length=1, max_length=MAX_LABEL_LENGTH, description="the whole label")
+    ],
     console: Booth,
     caller: Manager,
 ) -> Removed:
     """Delete all scans with exactly this label."""
-    found = console.index.find(label=label, limit=_MAX_LABEL_LENGTH)
+    found = console.index.ids_of(label)
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
-    for record in found:
-        console.audit.note(caller.name, caller.address, "delete", record.scan_id)
-        purge_scan(console.spool, record.scan_id)
-    return Removed(scans=[record.scan_id for record in found])
+    for scan_id in found:
+        console.audit.note(caller.name, caller.address, "delete", scan_id)
+        purge_scan(console.spool, scan_id)
+    return Removed(scans=found)
 
 
 def of_record(record: ScanRecord) -> Scan:

@@ -6,7 +6,7 @@ import logging
 import shutil
 import threading
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import zmq
@@ -66,8 +66,6 @@ class Watch:
         self._rate_hz: float | None = None
         self._framesets: tuple[int, float] | None = None
         self._seen: dict[str, str] | None = None
-        self._failed = (0, 0)
-        """Scans that failed, and scans that were cancelled."""
         self._spool_ns: tuple[int, ...] = ()
         self._stop = threading.Event()
         self._threads = [
@@ -99,7 +97,7 @@ class Watch:
         # What was said before the station fell silent may have passed.
         status = {} if self._fault else self._status
         spool = self._status.get("spool", {})
-        failed, cancelled = self._failed
+        cancelled = int(self._status.get("cancelled", 0))
         usage = shutil.disk_usage(self._config.spool.folder)
         return {
             "running": not self._fault,
@@ -110,7 +108,7 @@ class Watch:
             "cameras": [camera.document() for camera in self._cameras.values()],
             "framesets_hz": self._rate_hz,
             "spool": {place: int(spool.get(place, 0)) for place in (*PLACES, "done")},
-            "failed": failed,
+            "failed": max(0, int(spool.get("failed", 0)) - cancelled),
             "cancelled": cancelled,
             "disk_free_mb": usage.free / 1e6,
             "disk_needed_mb": self._config.spool.min_free_mb,
@@ -204,7 +202,6 @@ class Watch:
         if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
-        self._failed = self._index.count_failed()
         found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}
         states = {scan_id: scan.state for scan_id, scan in found.items()}
         before, self._seen = self._seen, dict(states)
@@ -250,8 +247,3 @@ class Watch:
         if fault != self._fault:
             self._fault = fault
             self._events.append("fault", {"fault": fault})
-
-
-def scan_document(scan: ScanRecord) -> dict[str, Any]:
-    """A record as the API shows it."""
-    return {**asdict(scan), "verdict": scan.verdict, "reasons": list(scan.reasons)}
