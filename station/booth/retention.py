@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,15 +23,15 @@ from station.core.commands import config_option
 from station.core.config import RetentionConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
-from station.core.files import held, read_bounded_json, write_bytes
+from station.core.files import delete, held, read_bounded_json, write_bytes
 from station.core.scans import STATES, ScanId, boot_id, scan_id_of
 from station.core.spool import Spool
 
 FILE = "retention.json"
+_LOCK = "retention.lock"
 LONGEST_OFF_S = 4 * 86_400.0
 """A long weekend."""
 _DAY_S = 86_400.0
-_MAX_LABEL_LENGTH = 10_000
 _MAX_BYTES = 16 << 20
 _BUSY = SpoolError("old scans are being removed at the moment; try again")
 _ORDER_S = 60.0
@@ -92,7 +92,7 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
     """Remove bundles of delivered scans, results, failed scans and notes that are past their time.
 
     Raises:
-        OSError: the disk refuses.
+        OSError: the disk refuses; what it lets go is removed all the same.
     """
     result_s = retention.result_days * _DAY_S
     limits_s = {
@@ -101,7 +101,7 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
         "failed": result_s,
         "scans": max(result_s, retention.raw_days * _DAY_S),
     }
-    with held(spool.folder / "retention.lock", _BUSY):
+    with held(spool.folder / _LOCK, _BUSY):
         ages = advance(_load(spool), now or Moment.now())
         folders = [
             f"{state}/{name}"
@@ -111,17 +111,30 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
         ]
         folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
         ages, old = due(ages, folders, limits_s)
-        removed = []
+        removed, refused = list[Path](), list[OSError]()
         for name in old:
-            state, scan_id = name.split("/", 1)
-            if state == "scans":
-                if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
-                    spool.notes.remove(ScanId(scan_id))
-                continue
-            spool.remove(spool.folder / name)
-            removed.append(spool.folder / name)
+            try:
+                if _expire(spool, name):
+                    removed.append(spool.folder / name)
+            except FileNotFoundError:
+                continue  # taken away meanwhile
+            except OSError as error:
+                refused.append(error)
         _save(spool, ages)
+    if refused:
+        raise refused[0]
     return removed
+
+
+def _expire(spool: Spool, name: str) -> bool:
+    """Remove what is past its time; False for a note, which is told with its scan."""
+    state, scan_id = name.split("/", 1)
+    if state != "scans":
+        spool.remove(spool.folder / name)
+        return True
+    if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
+        spool.notes.remove(ScanId(scan_id))
+    return False
 
 
 def _load(spool: Spool) -> Ages:
@@ -186,15 +199,12 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
         if not found:
             raise SpoolError(f"there is no scan {name} in {spool.folder}")
         for path in found:
-            if path.is_symlink() or not path.is_dir():
-                path.unlink()
-            elif path.parent.name in STATES:
+            if path.parent.name in STATES:
                 spool.remove(path)
             else:
-                shutil.rmtree(path)
-        with held(
-            spool.folder / "retention.lock", SpoolError("old scans are being removed; retrying")
-        ):
+                delete(path)
+        # Whoever removes old scans just now forgets this one, too.
+        with suppress(SpoolError), held(spool.folder / _LOCK, _BUSY):
             _save(spool, _load(spool))
     finally:
         if lock is not None:
@@ -236,13 +246,13 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
 
 
 def _purge_label(spool: Spool, label: str) -> list[Path]:
-    found = ScanIndex(spool).find(label=label, limit=_MAX_LABEL_LENGTH)
+    found = ScanIndex(spool).ids_of(label)
     if not found:
         raise SpoolError(
             f"there is no scan with the label {label!r}; see station list; "
             "a scan that is being taken is ended with station cancel"
         )
-    return [folder for scan in found for folder in purge_scan(spool, scan.scan_id)]
+    return [folder for scan_id in found for folder in purge_scan(spool, scan_id)]
 
 
 @click.command()

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from station.core.errors import SpoolError
 from station.core.files import (
+    delete,
     entries_of,
     fsync_folder,
     open_private,
@@ -183,8 +184,12 @@ class Spool(ScanFolders):
         """Remove leftovers of dead writers, except those that a delivery still needs."""
         needed = {note.result for scan_id in self.scans_in("work") if (note := self.note(scan_id))}
         for entry in (self.folder / "tmp").iterdir():
-            if entry.name not in needed and not _writer_lives(entry.name):
-                shutil.rmtree(entry, ignore_errors=True)
+            if entry.name in needed or _writer_lives(entry.name):
+                continue
+            # As much of a folder as the disk lets go.
+            shutil.rmtree(entry, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                delete(entry)
 
     def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""

@@ -12,6 +12,8 @@ import pytest
 
 from station.booth.retention import FILE, Moment, expire_old, purge_scan
 from station.core.config import RetentionConfig
+from station.core.errors import SpoolError
+from station.core.files import held
 from station.core.scans import REASON, ScanId, ScanNote
 from station.core.spool import Spool
 from workers.reconstruct.job_handle import WARM_UP_S
@@ -78,6 +80,33 @@ def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
     assert spool.path("queue", "a").exists()
 
 
+def test_one_scan_that_stays_keeps_no_other(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything that came after it was kept for ever."""
+    for name in ("a", "b", "c", "d"):
+        spool.path("done", name).mkdir()
+    spool.path("done", "c").rmdir()
+    spool.path("done", "c").write_text("no folder")
+    start = Moment(1.8e9, 100.0, "boot")
+    expire_old(spool, RetentionConfig(raw_days=2), start)
+    remove = Spool.remove
+
+    def refuse(spool: Spool, folder: Path) -> None:
+        if folder.name == "a":
+            raise PermissionError(13, "Permission denied", str(folder))
+        if folder.name == "b":
+            folder.rmdir()  # somebody takes it away at this moment
+        remove(spool, folder)
+
+    monkeypatch.setattr(Spool, "remove", refuse)
+    later = replace(start, since_boot_s=100.0 + 3 * _DAY_S)
+    with pytest.raises(PermissionError):
+        expire_old(spool, RetentionConfig(raw_days=2), later)
+    assert [path.name for path in (spool.folder / "done").iterdir()] == ["a"]
+    monkeypatch.undo()
+    assert expire_old(spool, RetentionConfig(raw_days=2), later) == [spool.path("done", "a")]
+    assert not list((spool.folder / "tmp").iterdir())
+
+
 @pytest.mark.parametrize("jump_days", [40.0, -40.0, -20000.0])
 def test_a_wall_clock_that_jumps_deletes_nothing(spool: Spool, jump_days: float) -> None:
     """A clock 40 days ahead, or a dead battery, deleted what had been scanned that day."""
@@ -115,3 +144,17 @@ def test_nothing_of_a_purged_scan_stays(spool: Spool) -> None:
     left = [path for path in spool.folder.rglob("*") if scan_id in path.name]
     assert [path.name for path in left] == [f"{scan_id}5.99.1"]
     assert scan_id not in (spool.folder / FILE).read_text()
+
+
+def test_a_scan_is_purged_while_old_ones_are_removed(spool: Spool) -> None:
+    """It was, and the command ended with an error that promised to retry."""
+    spool.path("outbox", "a").mkdir()
+    with held(spool.folder / "retention.lock", SpoolError("busy")):
+        assert purge_scan(spool, "a") == [spool.path("outbox", "a")]
+
+
+def test_a_file_among_what_dead_writers_left_is_removed(spool: Spool) -> None:
+    (spool.folder / "tmp/removed.0.1").write_text("no folder")
+    (spool.folder / "tmp/link.0.1").symlink_to("/nowhere")
+    spool.sweep()
+    assert not list((spool.folder / "tmp").iterdir())
