@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from station.core.config import BoothConfig
+from station.core.config_file import load_config
+from station.core.scans import ScanId
+from station.core.spool import Spool
 from station.sensors.recorded import RecordedCamera
+from workers.reconstruct import pool
 from workers.reconstruct.job_handle import JobProcess, Outcome
 
 _MODULE = """
@@ -60,6 +66,41 @@ def test_an_end_without_a_result_has_a_cause(
     outcome = _outcome(tmp_path, monkeypatch, act)
     assert (outcome.blame, outcome.status) == (blame, "")
     assert words in outcome.reason
+
+
+def test_a_process_that_cannot_start_costs_no_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A missing model sent every waiting scan to failed/, three tries each."""
+    (tmp_path / "no_job.py").write_text("raise SystemExit('the model is missing')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(pool, "JobProcess", lambda: JobProcess("no_job"))
+    monkeypatch.setattr(pool, "_DISK_PAUSE_S", 0.01)
+    (tmp_path / "booth.toml").write_text(
+        '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+    )
+    config = load_config(tmp_path / "booth.toml")
+    spool = Spool(config.spool.folder)
+    bundle = spool.temporary("a")
+    bundle.mkdir()
+    spool.submit(bundle, "a")
+    starts = 0
+
+    def started(problem: str) -> None:
+        nonlocal starts
+        starts += problem != ""
+
+    stop = threading.Event()
+    worker = pool.Worker(config, spool, stop, logging.getLogger("workers"))
+    monkeypatch.setattr(worker, "_trouble", started)
+    deadline_s = time.monotonic() + 60.0
+    while starts < config.workers.retries + 2:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    stop.set()
+    worker.thread.join()
+    assert (spool.waiting(), spool.scans_in("failed")) == (["a"], [])
+    assert spool.note(ScanId("a")).tries == spool.note(ScanId("a")).deaths == 0
 
 
 def test_a_sound_job_has_its_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,9 +25,10 @@ WARM_UP_S = 120.0
 a minute, or more on a busy machine."""
 _ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 
-Blame = Literal["scan", "job", "station", "disk", "nobody"]
+Blame = Literal["scan", "job", "station", "disk", "start", "nobody"]
 """Cause of a failure: the scan cannot be used; the job crashed or hung; something outside ended
-the process; the disk refused; the station is being stopped."""
+the process; the disk refused; the process ended before it had seen the scan; the station is being
+stopped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ class JobProcess:
                 reason=words,
                 evidence=evidence if isinstance(evidence, dict) else None,
             )
-        return _died(process.returncode)
+        return _died(process.returncode) if warm else _not_started(process.returncode)
 
     def _last_message(
         self, timeout_s: float, stop: threading.Event, begun: Callable[[], None]
@@ -151,8 +152,17 @@ class JobProcess:
 def _died(code: int) -> Outcome:
     if code in _ENDED_FROM_OUTSIDE:
         return Outcome(reason=f"the job was ended by {_signal(code)}", blame="station")
-    how = f"by {_signal(code)}" if code < 0 else f"with code {code}"
-    return Outcome(reason=f"the job ended unexpectedly, {how}", blame="job")
+    return Outcome(reason=f"the job ended unexpectedly, {_how(code)}", blame="job")
+
+
+def _not_started(code: int) -> Outcome:
+    """A model that is missing, or memory: no scan is at fault for it."""
+    reason = f"no job can be started, its process ended {_how(code)}; see the workers' log"
+    return Outcome(reason=reason, blame="start")
+
+
+def _how(code: int) -> str:
+    return f"by {_signal(code)}" if code < 0 else f"with code {code}"
 
 
 def _signal(code: int) -> str:

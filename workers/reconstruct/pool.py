@@ -1,9 +1,9 @@
 """Reconstruction workers: claim a scan, run it in a process of its own, deliver.
 
 Input that cannot be used fails at once with its reason; a job that crashes or hangs is retried a
-limited number of times; an end that the job did not cause (the station stopped, the disk refused)
-does not count as a try. The next job's process warms up while the current one works. A disk error
-does not end a worker: it continues when the disk works again.
+limited number of times; an end that the job did not cause (the station stopped, the disk refused,
+no process can be started) does not count as a try. The next job's process warms up while the
+current one works. A disk error does not end a worker: it continues when the disk works again.
 """
 
 from __future__ import annotations
@@ -40,6 +40,10 @@ _SLACK_S = 60.0
 """Beyond the time limits of a job and its warm-up, before a worker counts as hanging."""
 
 
+class _NoStartError(Exception):
+    """No process for a job can be started; the scan waits."""
+
+
 class Worker:
     """One thread that processes the queue."""
 
@@ -64,6 +68,9 @@ class Worker:
                     self.problem = ""
                 except OSError as error:
                     self._trouble(f"the disk cannot be used ({error})")
+                    continue
+                except _NoStartError as error:
+                    self._trouble(str(error))
                     continue
                 except Exception as error:
                     self._log.exception("a worker continues after an unexpected error")
@@ -127,6 +134,9 @@ class Worker:
         if outcome.blame == "disk":
             claim.put_back()
             raise OSError(outcome.reason)
+        if outcome.blame == "start":
+            claim.put_back()
+            raise _NoStartError(outcome.reason)
         if outcome.blame == "station":
             claim.count_death()
             given_up = claim.note.deaths > MAX_DEATHS
