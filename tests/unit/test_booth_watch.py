@@ -201,3 +201,41 @@ def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
     tasks.answer("1.7")
     _until(lambda: not tasks.state()["running"])
     assert tasks.state()["lines"] == ["1.7"]
+
+
+def test_a_task_that_complains_at_length_ends(tmp_path: Path) -> None:
+    """Nobody read its complaints before its end, and it waited for that for ever."""
+    script = "import sys; sys.stderr.write(100_000 * 'oh, ' + '\\nerror: no ball\\n'); sys.exit(1)"
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
+    tasks._begin("calibrate", "ball", [sys.executable, "-c", script])
+    _until(lambda: not tasks.state()["running"])
+    assert tasks.state()["error"] == "no ball"
+
+
+def test_bytes_that_are_no_text_end_no_task(tmp_path: Path) -> None:
+    """It was in progress for ever, and no other one could begin."""
+    script = "import sys; sys.stdout.buffer.write(b'\\xff\\n')"
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
+    for _ in range(2):
+        tasks._begin("calibrate", "ball", [sys.executable, "-c", script])
+        _until(lambda: not tasks.state()["running"])
+
+
+def test_an_answer_to_a_task_that_has_just_died_is_refused(tmp_path: Path) -> None:
+    script = _ASKS.partition('print(json.dumps({"kind": "done"')[0]
+    hangs = "import os, time; os.close(0); time.sleep(60)"
+    tasks = Tasks(tmp_path / "booth.toml", EventLog())
+    tasks._begin("calibrate", "stand", [sys.executable, "-c", script + hangs])
+    _until(lambda: bool(tasks.state()["waits_for"]))
+    _until(lambda: _refuses(tasks))
+    tasks.close()
+    _until(lambda: not tasks.state()["running"])
+
+
+def _refuses(tasks: Tasks) -> bool:
+    tasks._state["waits_for"] = "height"
+    try:
+        tasks.answer("1.7")
+    except RefusedError as error:
+        return "nothing is waiting" in str(error)
+    return False

@@ -7,17 +7,20 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from concurrent.futures import Future
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from station.console.live.control import RefusedError
 from station.console.live.events import EventLog
 from station.core.service import die_with_parent
 
 _LINES_KEPT = 60
+_COMPLAINT_BYTES = 1 << 16
 _EXITS_OF_A_CHECK = (0, 3, 4)
 """No camera has moved; one has; the booth looks too different to tell."""
 _ANSWERS = {"go": ("go",), "yes or no": ("yes", "no"), "height": ("no",)}
@@ -74,8 +77,11 @@ class Tasks:
             if word not in _ANSWERS[asked] and (asked != "height" or word in known):
                 raise RefusedError(f"this is no answer to the question; it asks for: {asked}")
             self._state["waits_for"] = ""
-            process.stdin.write(f"{word}\n")
-            process.stdin.flush()
+            try:
+                process.stdin.write(f"{word}\n")
+                process.stdin.flush()
+            except BrokenPipeError:
+                raise RefusedError("nothing is waiting for an answer") from None
         return self.state()
 
     def stop(self) -> dict[str, Any]:
@@ -103,25 +109,30 @@ class Tasks:
         return self.state()
 
     def _run(self, command: list[str], started: _Started) -> None:
-        try:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                preexec_fn=partial(die_with_parent, os.getpid()),
-            )
-        except BaseException as error:
-            # Whoever waits for the process waits for ever otherwise.
-            started.set_exception(error)
-            return
-        started.set_result(process)
-        self._read(process)
+        with ExitStack() as stack:
+            try:
+                # A file takes whatever the process complains of; a full pipe would stop it.
+                errors = stack.enter_context(tempfile.TemporaryFile())
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
+                    text=True,
+                    errors="replace",
+                    preexec_fn=partial(die_with_parent, os.getpid()),
+                )
+            except BaseException as error:
+                # Whoever waits for the process waits for ever otherwise.
+                started.set_exception(error)
+                return
+            started.set_result(process)
+            self._read(process)
+            code = process.wait()
+            self._end(code, _last_line(errors))
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
-        assert process.stderr is not None
         for line in process.stdout:
             try:
                 said = json.loads(line)
@@ -129,12 +140,12 @@ class Tasks:
                 continue
             if isinstance(said, dict):
                 self._handle(said)
-        words = process.stderr.read().strip().splitlines()
-        code = process.wait()
+
+    def _end(self, code: int, complaint: str) -> None:
         with self._lock:
             self._process = None
-            if words and code not in _EXITS_OF_A_CHECK:
-                self._state["error"] = words[-1].removeprefix("error: ")
+            if complaint and code not in _EXITS_OF_A_CHECK:
+                self._state["error"] = complaint.removeprefix("error: ")
             self._state |= {"running": False, "waits_for": "", "countdown_s": None}
         self._tell()
 
@@ -165,6 +176,13 @@ class Tasks:
 
     def _tell(self) -> None:
         self._events.append("calibration", self.state())
+
+
+def _last_line(errors: IO[bytes]) -> str:
+    """The last line of what a process complained of; empty if it did not."""
+    errors.seek(max(0, errors.seek(0, os.SEEK_END) - _COMPLAINT_BYTES))
+    lines = errors.read().decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else ""
 
 
 def _idle() -> dict[str, Any]:
