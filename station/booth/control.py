@@ -45,7 +45,7 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
-from station.core.files import private_folder, write_json
+from station.core.files import disk_words, private_folder, write_json
 from station.core.scans import CANCELLED, ScanId, ScanNote, boot_id, failure_reason, scan_id_of
 from station.core.service import Heartbeat, die_with_parent, only_process, stop_event
 from station.core.spool import Spool
@@ -172,11 +172,7 @@ class ControlProcess:
         except BoothError as error:
             reply = Reply(ok=False, error=str(error))
         except OSError as error:
-            reply = Reply(
-                ok=False,
-                error=f"the disk cannot be written ({error.strerror or error}: "
-                f"{error.filename or 'spool'}); free some space or repair it, see station status",
-            )
+            reply = Reply(ok=False, error=disk_words(error))
         try:
             self._requests.send_multipart([*route, reply.pack()])
         except zmq.ZMQError as error:

@@ -139,6 +139,14 @@ def entries_of(folder: Path) -> list[Path]:
         return []
 
 
+def disk_words(error: OSError) -> str:
+    """What the disk refuses and where, with the remedy."""
+    return (
+        f"the disk cannot be written ({error.strerror or error}: {error.filename or 'spool'}); "
+        "free some space or repair it, see station status"
+    )
+
+
 def delete(path: Path) -> None:
     """Remove a file, a link (not what it leads to), or a folder with its contents.
 

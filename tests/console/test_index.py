@@ -268,6 +268,16 @@ def test_the_api_tells_of_a_scan_that_was_never_stored_without_a_station(spool: 
     assert (scan.state, scan.reasons) == ("failed", ["the booth was stopped"])
 
 
+def test_a_scan_that_was_taken_after_all_is_not_said_to_have_failed(spool: Spool) -> None:
+    """Control answered the countdown too late, and took the scan."""
+    refused = {"state": "failed", "label": "Order 7", "reason": "control did not answer within 5 s",
+               "framesets": 0, "wanted": 0}  # fmt: skip
+    waiting = SimpleNamespace(status=lambda scan_id: {**refused, "scan_id": scan_id})
+    told: Any = SimpleNamespace(index=ScanIndex(spool), countdown=waiting)
+    assert _state(told, "20261120T100000Z-0000").state == "accepted"
+    assert _state(told, "20261125T100000Z-7f3a").state == "failed"
+
+
 def test_a_cancelled_scan_is_listed_as_such(spool: Spool) -> None:
     """It was said to have failed, as if something had gone wrong."""
     scan_id = "20261120T100000Z-0000"

@@ -226,13 +226,18 @@ def compare(first: str, second: str, console: Booth, caller: Reader) -> list[Cam
     """Shift and rotation of each camera between two calibrations, relative to the reference
     camera."""
     before, after = _known(console, first).rig, _known(console, second).rig
+    if before.reference not in after.cameras:
+        raise ProblemError(
+            409,
+            "not-comparable",
+            f"the calibrations cannot be compared: {second} has no camera {before.reference}",
+        )
     shifts = []
     for name in before.cameras.keys() & after.cameras.keys():
         here, there = (
             invert(rig.cameras[before.reference].world_from_camera)
             @ rig.cameras[name].world_from_camera
             for rig in (before, after)
-            if before.reference in rig.cameras
         )
         move = invert(here) @ there
         shifts.append(

@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from station.archive.index import IndexBusyError
 from station.console.live.control import NotRunningError, RefusedError
 from station.core.errors import BoothError
+from station.core.files import disk_words
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -91,6 +92,12 @@ def install(app: FastAPI) -> None:
             return _answer(503, "busy", str(error))
         kind = "refused" if isinstance(error, RefusedError) else "not-possible"
         return _answer(409, kind, str(error))
+
+    @app.exception_handler(OSError)
+    async def _disk(request: Request, error: OSError) -> JSONResponse:  # noqa: ARG001
+        if isinstance(error, FileNotFoundError):
+            return _answer(404, "gone", "it was moved away or deleted at this moment")
+        return _answer(503, "disk", disk_words(error))
 
     @app.exception_handler(HTTPException)
     async def _http(request: Request, error: HTTPException) -> JSONResponse:

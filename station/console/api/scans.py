@@ -109,12 +109,13 @@ def _age_s(mark: str) -> float:
 
 
 def _state(console: Console, scan_id: str) -> Scan:
-    waiting = console.countdown.status(scan_id)
-    if waiting is not None:
-        return _of_session(waiting)
+    # First what is on disk: a station whose answer came too late for the countdown took the scan.
     record = console.index.get(scan_id)
     if record is not None:
         return of_record(record)
+    waiting = console.countdown.status(scan_id)
+    if waiting is not None:
+        return _of_session(waiting)
     try:
         found = _of_session(command(console.config, Request("scan-status", scan_id)))
     except RefusedError as error:

@@ -67,7 +67,8 @@ class Pictures:
                 break
             try:
                 self._serve(context)
-            except (BoothError, zmq.ZMQError) as error:
+            except (BoothError, OSError, ValueError, zmq.ZMQError) as error:
+                # ValueError: a frame whose header and pixels do not fit together.
                 self._log.warning("depth pictures: %s", error)
                 self._stop.wait(1.0)
         context.destroy(linger=0)
