@@ -6,6 +6,7 @@ const KINDS = ['camera', 'framesets', 'scan', 'job', 'result', 'fault', 'calibra
 const listeners = new Set();
 let source = null;
 let lost = false;
+let again = null;
 
 // Calls `heard(kind, data)` until the returned function is called. Kinds beside the console's own:
 // "lost" and "back" tell of the connection.
@@ -25,12 +26,14 @@ export function connect() {
     if (!lost) { lost = true; tell('lost', {}); }
     if (source.readyState === EventSource.CLOSED) {
       source = null;
-      setTimeout(connect, 1000);
+      again = setTimeout(connect, 1000);
     }
   };
 }
 
 export function disconnect() {
+  // Else whoever has to log in first is refused once a second.
+  clearTimeout(again);
   if (source) source.close();
   source = null;
 }

@@ -1,6 +1,7 @@
 // All scans: search, compare, delete.
 
 import { get, remove } from './api.js';
+import { startOf } from './days.js';
 import { ask, h, icon, notice } from './dom.js';
 import { listen } from './events.js';
 import { t, time } from './i18n.js';
@@ -63,8 +64,7 @@ export async function history(main, session) {
 
   async function load(fresh = true) {
     if (fresh) cursor = '';
-    const next = (day) => new Date(new Date(day).getTime() + 86400000).toISOString().slice(0, 10);
-    const query = new URLSearchParams({ text: search.value, since: since.value, until: until.value ? next(until.value) : '', limit: PAGE, cursor });
+    const query = new URLSearchParams({ text: search.value, since: since.value ? startOf(since.value) : '', until: until.value ? startOf(until.value, 1) : '', limit: PAGE, cursor });
     const page = await get(`/scans?${query}`);
     cursor = page.next;
     more.hidden = !cursor;
