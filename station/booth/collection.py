@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from station.booth.frameset import Frameset
+from station.core.errors import BoothError
 from station.core.kinect_v1 import FRAME_RATE_HZ
 from station.core.rig import Rig
 from station.core.scans import ScanId
@@ -47,8 +48,18 @@ class Collection:
         return len(self.sets) >= self.wanted
 
     def depth_scale_m(self) -> float:
-        """Metres per unit of its depth images."""
-        return next(iter(self.sets[0].frames.values())).header.depth_scale_m
+        """Metres per unit of its depth images, which a bundle has one of.
+
+        Raises:
+            BoothError: its cameras have several.
+        """
+        frames = [frame for found in self.sets for frame in found.frames.values()]
+        scales = {frame.header.depth_scale_m for frame in frames}
+        if len(scales) > 1:
+            raise BoothError(
+                "the cameras' depth images are in different units; use sensors of one kind"
+            )
+        return scales.pop()
 
 
 def went_silent_words(silent: Sequence[str], recorded: Set[str]) -> str:

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 
-from station.booth.collection import check_words, too_slow_words, went_silent_words
+from station.booth.collection import (
+    Collection,
+    Order,
+    check_words,
+    too_slow_words,
+    went_silent_words,
+)
+from station.booth.frameset import Frameset
+from station.core.errors import BoothError
+from station.core.scans import ScanId
+from station.messaging.intake import LiveFrame
+from station.messaging.messages import FrameHeader
 
 
 @pytest.mark.parametrize(
@@ -38,3 +52,19 @@ def test_several_cameras_are_named_in_the_plural() -> None:
     one = went_silent_words(["a"], set())
     assert one == "camera a went silent; check its cable; scan again"
     assert went_silent_words([], set()) == ""
+
+
+def _frame(camera: str, scale_m: float) -> LiveFrame:
+    header = FrameHeader(camera, camera, 2, 2, scale_m, 0, 30.0, 0.0, 0.0, 0, 0)
+    return LiveFrame(header, np.zeros((2, 2), np.uint16))
+
+
+def test_a_bundle_has_depths_of_one_unit() -> None:
+    """A camera in millimetres among those in tenths of one would be ten times as near."""
+    no_rig: Any = None
+    scan = Collection(Order(ScanId("a"), "", 0.0), no_rig, 1, 0.0)
+    scan.add(Frameset({"a": _frame("a", 1e-4), "b": _frame("b", 1e-4)}, 0.0, 0.0), 0.0)
+    assert scan.depth_scale_m() == 1e-4
+    scan.add(Frameset({"a": _frame("a", 1e-4), "b": _frame("b", 1e-3)}, 0.0, 0.0), 0.0)
+    with pytest.raises(BoothError, match="different units"):
+        scan.depth_scale_m()
