@@ -134,7 +134,9 @@ def check(backup: Path) -> list[str]:
         changed.
     """
     manifest = read_json(backup / MANIFEST, format=FORMAT, versions=(VERSION,))
-    expected: dict[str, str] = manifest["sha256"]
+    expected, names = manifest.get("sha256"), manifest.get("parts")
+    if not isinstance(expected, dict) or not isinstance(names, list):
+        raise FormatError(f"{backup / MANIFEST} is damaged; use another backup")
     found = {str(path.relative_to(backup)) for path in _files(backup)} - {MANIFEST}
     for name in sorted(expected.keys() - found):
         raise FormatError(f"{backup} does not contain {name}; use another backup")
@@ -145,7 +147,7 @@ def check(backup: Path) -> list[str]:
     for name, digest in expected.items():
         if sha256(backup / name) != digest:
             raise FormatError(f"{backup / name} has changed since it was saved; use another backup")
-    return [str(name) for name in manifest["parts"]]
+    return [str(name) for name in names]
 
 
 def restore_part(backup: Path, one: Part) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -91,7 +92,8 @@ def booth_toml(cameras: Sequence[FreenectCamera], *, installed: bool) -> str:
         if camera.serial:
             lines.append(f'serial = "{camera.serial}"')
         if camera.recording is not None:
-            lines.append(f'recording = "{camera.recording}"')
+            # Quotes and backslashes are escaped as in JSON.
+            lines.append(f"recording = {json.dumps(str(camera.recording), ensure_ascii=False)}")
     if installed:
         lines += ["", "[calibrate]", f'folder = "{STATE_FOLDER / "calibrations"}"']
         lines += ["", "[spool]", f'folder = "{STATE_FOLDER / "spool"}"']

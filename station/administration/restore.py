@@ -77,7 +77,8 @@ def _restore(backup: Path, path: Path) -> tuple[list[str], list[Path]]:
 
 
 def _protect(folder: Path) -> None:
-    """The services read the configuration and do not write it."""
-    for place in folder.iterdir():
-        shutil.chown(place, "root", USER)
-        place.chmod(0o640)
+    """The services read the configuration and what lies beside it, and do not write it."""
+    for place in folder.rglob("*"):
+        if not place.is_symlink():
+            shutil.chown(place, "root", USER)
+            place.chmod(0o750 if place.is_dir() else 0o640)

@@ -137,7 +137,7 @@ def _find(
 ) -> list[FreenectCamera]:
     if recordings is not None:
         folder = recordings.resolve()
-        if installed and str(folder).startswith(_UNREADABLE):
+        if installed and any(folder.is_relative_to(place) for place in _UNREADABLE):
             raise ConfigError(
                 f"the services cannot read {folder}; copy it to {STATE_FOLDER}/recordings"
             )

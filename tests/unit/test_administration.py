@@ -17,7 +17,7 @@ from station.administration.backup import backup
 from station.administration.booth_file import administration, booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
 from station.administration.migrate import MIGRATIONS, VERSION, migrate
-from station.administration.restore import restore
+from station.administration.restore import _protect, restore
 from station.administration.setup import compare_sensors, setup
 from station.core import bundle, rig
 from station.core.config_file import load_config
@@ -77,6 +77,28 @@ def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds no recordings"):
         _run(setup, "--config", tmp_path / "booth.toml", "--recordings", tmp_path)
     assert not (tmp_path / "booth.toml").exists()
+
+
+def test_recordings_may_lie_in_a_folder_of_any_name(tmp_path: Path) -> None:
+    """What was written was no TOML, and the booth had to be set up by hand."""
+    recordings = _recordings(tmp_path / 'the "good" ones \\ 录像')
+    _run(setup, "--config", tmp_path / "booth.toml", "--recordings", recordings)
+    folders = {getattr(c, "recording", None) for c in load_config(tmp_path / "booth.toml").cameras}
+    assert folders == {recordings / "front-lower", recordings / "back-upper"}
+
+
+def test_what_is_restored_beside_the_configuration_can_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder without the right to enter hid the key of a webhook from the services."""
+    monkeypatch.setattr(shutil, "chown", lambda *_: None)
+    (tmp_path / "keys").mkdir(0o700)
+    (tmp_path / "keys/orders").write_text("topsecret")
+    (tmp_path / "booth.toml").write_text("")
+    (tmp_path / "link").symlink_to("/nowhere")
+    _protect(tmp_path)
+    modes = {p.name: p.lstat().st_mode & 0o777 for p in tmp_path.rglob("*") if not p.is_symlink()}
+    assert modes == {"keys": 0o750, "orders": 0o640, "booth.toml": 0o640}
 
 
 def test_setup_takes_no_recording_whose_name_no_camera_can_have(tmp_path: Path) -> None:
@@ -257,7 +279,7 @@ def test_journals_that_a_killed_process_left_are_no_parts(booth: Path, tmp_path:
     assert not any(name.endswith(("-wal", "-shm")) for name in names)
 
 
-@pytest.mark.parametrize("fault", ["changed", "missing", "extra", "version", "name"])
+@pytest.mark.parametrize("fault", ["changed", "missing", "extra", "version", "name", "no sums"])
 def test_a_damaged_backup_changes_nothing(booth: Path, tmp_path: Path, fault: str) -> None:
     saved, _ = save(tmp_path / "usb", booth, load_config(booth), with_scans=False)
     manifest = json.loads((saved / "backup.json").read_text())
@@ -269,6 +291,8 @@ def test_a_damaged_backup_changes_nothing(booth: Path, tmp_path: Path, fault: st
         (saved / "content/more").write_text("")
     elif fault == "version":
         manifest["version"] = 2
+    elif fault == "no sums":
+        del manifest["sha256"]
     else:
         manifest["parts"].append("etc/../../passwd")
     (saved / "backup.json").write_text(json.dumps(manifest))
