@@ -251,7 +251,7 @@ def _count_cancelled(failed: Path, changed_ns: int, count: int) -> int:  # noqa:
 
 
 def _entries(folder: Path) -> dict[str, os.stat_result]:
-    """What lies in a folder of the spool; what leaves it at this moment is left out."""
+    """Entries of a folder of the spool, without those that leave it at this moment."""
     found = {}
     for entry in folder.iterdir():
         with suppress(FileNotFoundError):

@@ -140,7 +140,7 @@ def entries_of(folder: Path) -> list[Path]:
 
 
 def disk_words(error: OSError) -> str:
-    """What the disk refuses and where, with the remedy."""
+    """Words on a refusal of the disk, with its place and the remedy."""
     return (
         f"the disk cannot be written ({error.strerror or error}: {error.filename or 'spool'}); "
         "free some space or repair it, see station status"

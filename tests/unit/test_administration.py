@@ -80,7 +80,7 @@ def test_setup_says_where_the_recordings_are_missing(tmp_path: Path) -> None:
 
 
 def test_recordings_may_lie_in_a_folder_of_any_name(tmp_path: Path) -> None:
-    """What was written was no TOML, and the booth had to be set up by hand."""
+    """Set-up wrote no TOML, and the booth had to be set up by hand."""
     recordings = _recordings(tmp_path / 'the "good" ones \\ 录像')
     _run(setup, "--config", tmp_path / "booth.toml", "--recordings", recordings)
     folders = {getattr(c, "recording", None) for c in load_config(tmp_path / "booth.toml").cameras}
