@@ -21,7 +21,7 @@ from workers.scape.model.body_model import load_model
 ROOT = Path(__file__).parents[2]
 SPEAKERS = (
     "workers/scape/fit/verdict.py", "workers/scape/fit/seen_words.py",
-    "workers/cloud/preprocess.py",
+    "workers/cloud/preprocess.py", "workers/cloud/floor_level.py",
     "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
     "station/booth/session.py", "station/booth/sync.py", "station/booth/control.py",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.images import Image
+from station.core.errors import InputError
 from station.core.rig import CameraCalibration, PredictedError
 
 Array = NDArray[np.float64]
@@ -91,3 +92,23 @@ class Preprocessed:
     findings: tuple[Finding, ...]
     predicted: PredictedError | None = None
     """Errors that the calibration adds by its own statement; None for bare clouds and old files."""
+
+
+def check_shows_a_body(cloud: PointCloud) -> None:
+    """Refuse a cloud that no body can be fitted to.
+
+    Raises:
+        InputError: it has values that are not numbers, or is no standing adult in metres.
+    """
+    if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.normals).all()):
+        raise InputError(
+            "the cloud holds values that are not numbers; repair the file or scan again"
+        )
+    if len(cloud) < MIN_POINTS:
+        raise InputError(f"the cloud has {len(cloud)} points; a body needs {MIN_POINTS}")
+    height_m = float(np.ptp(cloud.points[:, 2]))
+    if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
+        raise InputError(
+            f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected: "
+            "scan the whole person, from the soles to the top of the head"
+        )

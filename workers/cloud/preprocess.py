@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 from station.core.bundle import Bundle
 from station.core.config import Volume
 from station.core.depth.images import Image, jumps
-from station.core.geometry import transform
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
 from workers.cloud.average import average, random_sigma_m
+from workers.cloud.floor_level import floor_heights, lowered_floor, raised_floor
 from workers.cloud.noise import noise_ratio
-from workers.cloud.observed import (
-    LOWERED_FLOOR,
-    RAISED_FLOOR,
-    CameraView,
-    Finding,
-    PointCloud,
-    Preprocessed,
-)
+from workers.cloud.observed import CameraView, Finding, PointCloud, Preprocessed
 from workers.cloud.one_person import cells_of, one_person
 from workers.cloud.points import normals, within
 
@@ -64,18 +57,6 @@ _MIN_FRAMES_SHARE = 0.5
 """Share of the expected frames below which a camera is reported."""
 _PLENTY_OF_FRAMES = 10
 """Frames that are enough, however many others were lost."""
-_NEAR_FLOOR_M, _LEVEL_COSINE, _FLOOR_CELL_M, _RAISED_FLOOR_M2 = 0.04, 0.9, 0.02, 0.05
-"""Height and normals of a mat, and its least area in cells of this size: toes cover up to 0.016 m2
-in 14 sound scans and 0.022 in the demo's, what noise lifts of an 8 mm mat above the clearance 0.2.
-"""
-_RAISED_NOISE_M = 0.006
-"""Height above the middle of a mat's points up to which there are others."""
-_FLOOR_STRIDE, _FLOOR_BAND_M, _FLOOR_READINGS = 4, 0.06, 1000
-"""Every so many rows and columns are looked at for the floor, readings so near to z = 0 are it, and
-how many of them say where it is."""
-_LOWERED_FLOOR_M = -0.006
-"""Median height of the floor's readings below which it is not the calibrated one: 0.5 to 3.1 mm
-in 36 sound scans."""
 _SIGMA_FLOOR_M = 4e-4
 """Standard deviation that averaging more frames does not remove: quantisation, calibration."""
 
@@ -131,14 +112,14 @@ def preprocess(bundle: Bundle, volume: Volume | None = None) -> Preprocessed:
         noticed = pool.map(partial(_camera_findings, expected), names, cameras, kept)
         views, clouds = zip(*cleaned, strict=True)
         findings += [finding for of_camera in noticed for finding in of_camera]
-    findings += _lowered_floor([camera.floor_m for camera in cameras])
+    findings += lowered_floor([camera.floor_m for camera in cameras])
     findings += [
         Finding("camera-blind", name, None, f"camera {name} sent no frame; check its cable")
         for name in bundle.rig.cameras
         if name not in names
     ]
     cloud = _merged(names, clouds, [camera.excess_noise_m for camera in cameras])
-    floor, raised = _raised_floor(cloud)
+    floor, raised = raised_floor(cloud)
     if raised:
         cloud, findings = _without(cloud, floor), [*findings, *raised]
     return Preprocessed(cloud, views, tuple(findings), bundle.rig.predicted)
@@ -149,7 +130,7 @@ def _camera(bundle: Bundle, name: str, volume: Volume) -> _Camera:
     averaged = average(bundle.depth_stack(name), bundle.depth_scale_m)
     depth = calibration.depth_correction.apply(averaged.depth_m).astype(np.float32)
     near = _in_volume(calibration, depth, volume)
-    floor_m = _floor_heights(calibration, depth, volume)
+    floor_m = floor_heights(calibration, depth, volume)
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     restless = _in_volume(calibration, averaged.unsettled_m, volume)
     unsettled = float(restless.sum() / max(1, (near | restless).sum()))
@@ -229,31 +210,6 @@ def _in_volume(calibration: CameraCalibration, depth_m: Image, volume: Volume) -
     return within(rays(calibration), depth_m, pose, low, np.array(volume.max_m))
 
 
-def _floor_heights(calibration: CameraCalibration, depth_m: Image, volume: Volume) -> Array:
-    """Heights of some of the readings near the floor."""
-    some = np.s_[::_FLOOR_STRIDE, ::_FLOOR_STRIDE]
-    low, high = np.array(volume.min_m), np.array(volume.max_m)
-    low[2], high[2] = -_FLOOR_BAND_M, _FLOOR_BAND_M
-    directions, depths = rays(calibration)[some], depth_m[some]
-    points = (directions * depths[..., None])[depths > 0.0]
-    places = transform(calibration.world_from_camera, points)
-    return np.asarray(places[((places > low) & (places < high)).all(axis=1), 2])
-
-
-def _lowered_floor(heights_m: Sequence[Array]) -> list[Finding]:
-    """The finding that the floor lies lower than the calibrated one, where it does."""
-    readings_m = np.concatenate(heights_m)
-    if len(readings_m) < _FLOOR_READINGS:
-        return []
-    level_m = float(np.median(readings_m))
-    if level_m > _LOWERED_FLOOR_M:
-        return []
-    message = (
-        f"the floor lies {-1e3 * level_m:.0f} mm lower than at the calibration; run: station check"
-    )
-    return [Finding(LOWERED_FLOOR, None, level_m, message)]
-
-
 def _cleaned(camera: _Camera, keep: Mask) -> tuple[CameraView, tuple[Array, Array, Array]]:
     person = np.zeros(camera.depth_m.shape, bool)
     person.flat[camera.pixels[keep]] = True
@@ -284,21 +240,6 @@ def _merged(
         camera_names=tuple(names),
         excess_noise_m=float(np.sqrt(excess2)),
     )
-
-
-def _raised_floor(cloud: PointCloud) -> tuple[Mask, list[Finding]]:
-    """Points (n,) of what people stand on, and the finding that it lies higher than the calibrated
-    floor, where it does."""
-    height_m = cloud.points[:, 2]
-    low = (height_m < _NEAR_FLOOR_M) & (cloud.normals[:, 2] > _LEVEL_COSINE)
-    cells = np.unique(np.floor(cloud.points[low, :2] / _FLOOR_CELL_M), axis=0)
-    if len(cells) * _FLOOR_CELL_M**2 < _RAISED_FLOOR_M2:
-        return low, []
-    message = (
-        "the floor lies higher than at the calibration: take mats away, or calibrate with them"
-    )
-    level_m = float(np.median(height_m[low]))
-    return height_m < level_m + _RAISED_NOISE_M, [Finding(RAISED_FLOOR, None, level_m, message)]
 
 
 def _without(cloud: PointCloud, left_out: Mask) -> PointCloud:

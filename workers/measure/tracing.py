@@ -37,12 +37,12 @@ from workers.measure.sections import (
     Index,
     around,
     cross,
-    encloses,
     hull_order,
     loop_length,
     plane_axes,
     surface_order,
 )
+from workers.measure.tapes import Tape, tapes_around
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import area_vectors
 
@@ -50,8 +50,6 @@ Array = NDArray[np.float64]
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEARANCE_M = 0.02
 """Distance between a plane and the landmark `Perpendicular.beyond`, at least."""
-_MIN_LOOP = 8
-"""Points of a section from which a piece may be a loop of skin."""
 _BROKEN_SHARE = 0.1
 """Share of rows whose planes miss what they should cut, beyond which the mesh is no body."""
 
@@ -110,17 +108,6 @@ def _net(model: BodyModel, parts: tuple[str, ...]) -> EdgeNet:
     return EdgeNet.build(model.faces[_triangles(model, parts)])
 
 
-@dataclass(frozen=True, slots=True)
-class _Tape:
-    """Tape around a section."""
-
-    points: EdgePoints
-    places: Array
-    """(n, 3)."""
-    normal: Array
-    """Unit normal of the section's plane."""
-
-
 def _unit(vector: Array) -> Array:
     """A vector at length 1.
 
@@ -134,23 +121,6 @@ def _unit(vector: Array) -> Array:
     return np.asarray(vector / length)
 
 
-def _tapes_around(
-    found: EdgePoints, places: Array, piece: Index, normal: Array, middle: Array
-) -> list[_Tape]:
-    """Tapes around those pieces of a section that go around a place."""
-    tapes = []
-    for chosen in (np.flatnonzero(piece == index) for index in np.unique(piece)):
-        if len(chosen) < _MIN_LOOP:
-            continue
-        try:
-            tape = chosen[hull_order(places[chosen], normal)]
-        except ValueError:
-            continue  # all on a line
-        if encloses(places[tape], normal, middle):
-            tapes.append(_Tape(found.take(tape), places[tape], normal))
-    return tapes
-
-
 class _Tracer:
     def __init__(self, model: BodyModel, vertices: Array) -> None:
         self._model = model
@@ -158,7 +128,7 @@ class _Tracer:
         corners = vertices[model.faces]
         self._middles = corners.mean(axis=1)
         self._area_vectors = area_vectors(vertices, model.faces)
-        self._cuts: dict[Section, _Tape] = {}
+        self._cuts: dict[Section, Tape] = {}
         self.missed: list[str] = []
         """Rows whose planes missed what they should cut, and why."""
 
@@ -236,7 +206,7 @@ class _Tracer:
         weight = np.exp((reach - reach.max()) / (PROTRUSION_SHARE * (high - low)))
         return np.asarray(weight @ candidates / weight.sum())
 
-    def _narrowest(self, section: Section, plane: Narrowest) -> _Tape:
+    def _narrowest(self, section: Section, plane: Narrowest) -> Tape:
         across = self._at(plane.other_side) - self._at(plane.side)
         ahead = cross(across, _UP)
         ahead /= np.linalg.norm(ahead)
@@ -246,12 +216,12 @@ class _Tracer:
         middle = 0.5 * (front + self._at(plane.back))
         net = _net(self._model, section.parts)
         most_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
-        tapes: list[tuple[float, float, _Tape]] = []
+        tapes: list[tuple[float, float, Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
             found, crossing = net.cut(self._vertices, front, normal)
             places = found.on(self._vertices)
-            for tape in _tapes_around(found, places, net.pieces(crossing), normal, middle):
+            for tape in tapes_around(found, places, net.pieces(crossing), normal, middle):
                 girth_m = loop_length(tape.places, closed=True)
                 if girth_m < most_m:
                     tapes.append((girth_m, tilt, tape))
@@ -262,7 +232,7 @@ class _Tracer:
             raise NoLineError("it is narrowest at the steepest plane")
         return least
 
-    def _thickest(self, section: Section, plane: Thickest) -> _Tape:
+    def _thickest(self, section: Section, plane: Thickest) -> Tape:
         low, high = self._plane(plane.lower)[0], self._plane(plane.upper)[0]
         places = np.linspace(low, high, THICKEST_LEVELS)
         tapes = [self._tape(section, place, _UP) for place in places]
@@ -275,7 +245,7 @@ class _Tracer:
         place = places[most] + steps * (places[1] - places[0])
         return self._tape(section, place, _UP)
 
-    def _cut(self, section: Section) -> _Tape:
+    def _cut(self, section: Section) -> Tape:
         """Tape around a section; kept for breadth and depth."""
         key = Section(section.plane, section.parts, section.whole)
         if key not in self._cuts:
@@ -288,19 +258,19 @@ class _Tracer:
                     self._cuts[key] = self._tape(section, *self._plane(plane))
         return self._cuts[key]
 
-    def _tape(self, section: Section, point: Array, normal: Array) -> _Tape:
+    def _tape(self, section: Section, point: Array, normal: Array) -> Tape:
         net = _net(self._model, section.parts)
         found, crossing = net.cut(self._vertices, point, normal)
         places = found.on(self._vertices)
         if not section.whole and len(places):
             piece = net.pieces(crossing)
-            if np.ptp(piece) and (tapes := _tapes_around(found, places, piece, normal, point)):
+            if np.ptp(piece) and (tapes := tapes_around(found, places, piece, normal, point)):
                 return max(tapes, key=lambda tape: loop_length(tape.places, closed=True))
             wanted = piece[np.argmin(np.linalg.norm(places - point, axis=1))]
             chosen = np.flatnonzero(piece == wanted)
             found, places = found.take(chosen), places[chosen]
         tape = hull_order(places, normal)
-        return _Tape(found.take(tape), places[tape], normal)
+        return Tape(found.take(tape), places[tape], normal)
 
     def _section(self, definition: Definition, section: Section) -> tuple[float, EdgePoints, bool]:
         tape = self._cut(section)

@@ -6,8 +6,9 @@ import os
 import shlex
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -15,6 +16,9 @@ from station.core.commands import writable_folder
 from station.core.errors import InputError
 from station.core.files import PRIVATE_FOLDER_MODE, publish_folder
 from workers.scape.fit.fit import Method
+
+if TYPE_CHECKING:
+    from workers.reconstruct.job import JobSummary
 
 
 @click.command()
@@ -74,18 +78,7 @@ def fit(
         if source is not None and not source.exists():
             raise InputError(f"{source} does not exist")
     _check_folders(out_folder, debug_folder)
-    from workers.cloud.cloud_file import read_cloud
-    from workers.reconstruct import job
-    from workers.scape.fit.observer import Observer, unobserved
-    from workers.scape.model.body_model import load_model
-
-    model = None
-    observer: Observer = unobserved
-    if debug_folder is not None:
-        from workers.pictures.debug_pictures import DebugPictures
-
-        model = load_model()
-        observer = DebugPictures(debug_folder, model.faces)
+    from workers.reconstruct.job import reconstruct_bundle
 
     def show(step: str, share: float) -> None:
         if not quiet:
@@ -93,26 +86,12 @@ def fit(
 
     temporary = Path(tempfile.mkdtemp(prefix=".fit-", dir=out_folder.parent))
     try:
+        options = {"method": method, "progress": show, **_observation(debug_folder)}
         if bundle is not None:
-            summary = job.reconstruct_bundle(
-                bundle, temporary, method=method, model=model, progress=show, observer=observer
-            )
+            summary = reconstruct_bundle(bundle, temporary, **options)
         else:
             assert cloud is not None
-            show("reading", 0.0)
-            points = read_cloud(cloud, up, unit)
-            if points.blank:
-                said = f"{cloud}: {points.blank} points without a reading (NaN) are left out"
-                click.echo(said, err=True)
-            summary = job.reconstruct_cloud(
-                points,
-                cloud.stem,
-                temporary,
-                method=method,
-                model=model,
-                progress=show,
-                observer=observer,
-            )
+            summary = _of_cloud(cloud, up, unit, temporary, options)
         _publish(temporary, out_folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -122,6 +101,31 @@ def fit(
     if not quiet:
         folder = shlex.quote(str(out_folder))
         click.echo(f"its table: reconstruct measure {folder}", err=True)
+
+
+def _observation(debug_folder: Path | None) -> dict[str, Any]:
+    """Options of a fit of which pictures are drawn; none without a folder for them."""
+    if debug_folder is None:
+        return {}
+    from workers.pictures.debug_pictures import DebugPictures
+    from workers.scape.model.body_model import load_model
+
+    model = load_model()
+    return {"model": model, "observer": DebugPictures(debug_folder, model.faces)}
+
+
+def _of_cloud(
+    cloud: Path, up: str, unit: str, folder: Path, options: Mapping[str, Any]
+) -> JobSummary:
+    from workers.cloud.cloud_file import read_cloud
+    from workers.reconstruct.job import reconstruct_cloud
+
+    options["progress"]("reading", 0.0)
+    points = read_cloud(cloud, up, unit)
+    if points.blank:
+        said = f"{cloud}: {points.blank} points without a reading (NaN) are left out"
+        click.echo(said, err=True)
+    return reconstruct_cloud(points, cloud.stem, folder, **options)
 
 
 def _publish(temporary: Path, out_folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,21 +245,7 @@ def wave_ball(
         lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
     session.begin_run()
     resets: dict[str, int] = {}
-    waiting: list[BallDetection] = []
-
-    def keep(balls: list[BallDetection]) -> None:
-        for ball in balls:
-            coverage.add(ball)
-        waiting.extend(balls)
-
-    def write() -> None:
-        nonlocal again
-        # Emptied first: whatever interrupts the writing, nothing is written twice.
-        seen = list(waiting)
-        waiting.clear()
-        session.record_balls(seen, again=again)
-        again = again and not seen
-
+    waved = _Waved(session, coverage, again)
     began_s = written_s = time.monotonic()
     with BallFinder(session, every_frame=feed.replays, held=True) as finder:
         try:
@@ -267,33 +254,60 @@ def wave_ball(
                     if resets.setdefault(frame.camera, frame.clock_resets) != frame.clock_resets:
                         # What follows cannot be put in time with what went before, of which some
                         # is still being looked at.
-                        keep(finder.found(wait=True))
-                        write()
+                        waved.keep(finder.found(wait=True))
+                        waved.write()
                         session.begin_run()
                         resets[frame.camera] = frame.clock_resets
                     finder.submit([frame])
-                keep(finder.found())
+                waved.keep(finder.found())
                 now_s = time.monotonic()
                 if now_s - written_s > _WRITE_EVERY_S:
-                    write()
+                    waved.write()
                     written_s = now_s
                 left_s = lasts_s - (now_s - began_s)
                 guide.progress(_wave_line(coverage, left_s, finder.waiting))
                 if not feed.replays and left_s < (0.0 if coverage.enough else -lasts_s):
                     break
             while finder.waiting:
-                keep(finder.found())
-                write()
+                waved.keep(finder.found())
+                waved.write()
                 if finder.waiting:
                     guide.progress(f"looking for the ball in {finder.waiting} more frames")
                 time.sleep(_LOOK_EVERY_S)
         finally:
-            write()
+            waved.write()
+    _tell_waved(coverage, guide, replaced=not waved.again)
+
+
+@dataclass(slots=True)
+class _Waved:
+    """Detections of the ball on its way: all of them count, and some are not on disk yet."""
+
+    session: Session
+    coverage: Coverage
+    again: bool
+    """Earlier detections are to be forgotten, and are there still."""
+    waiting: list[BallDetection] = field(default_factory=list)
+
+    def keep(self, balls: list[BallDetection]) -> None:
+        for ball in balls:
+            self.coverage.add(ball)
+        self.waiting.extend(balls)
+
+    def write(self) -> None:
+        # Emptied first: whatever interrupts the writing, nothing is written twice.
+        seen = list(self.waiting)
+        self.waiting.clear()
+        self.session.record_balls(seen, again=self.again)
+        self.again = self.again and not seen
+
+
+def _tell_waved(coverage: Coverage, guide: Guide, *, replaced: bool) -> None:
     counts = ", ".join(f"{name} {count}" for name, count in coverage.counts().items())
     guide.done(f"the ball was seen well: {counts}")
     for name, (near, moments) in coverage.links().items():
         guide.say(f"{name} and {near} saw the ball at the same time {moments} times")
-    if again:
+    if not replaced:
         guide.say("nothing replaces what was seen of the ball before, which is kept")
     if not coverage.enough:
         guide.say(f"more positions would help: {coverage.advice()}")

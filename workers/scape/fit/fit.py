@@ -13,14 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from station.core.errors import InputError
-from workers.cloud.observed import (
-    MIN_POINTS,
-    POSSIBLE_HEIGHTS_M,
-    Finding,
-    PointCloud,
-    Preprocessed,
-)
+from workers.cloud.observed import Finding, PointCloud, Preprocessed, check_shows_a_body
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
 from workers.scape.evidence.crown import crown_sigma_m
 from workers.scape.evidence.rims import rims_of
@@ -170,7 +163,7 @@ def fit_overlapping(
         InputError: the cloud holds no body that could be fitted.
     """
     cloud = scan.cloud
-    _check(cloud)
+    check_shows_a_body(cloud)
     observer("cloud", {"points": cloud.points, "normals": cloud.normals})
     start = time.monotonic()
     progress("aligning", 0.0)
@@ -341,18 +334,3 @@ def _best_start(
 
 def _report(progress: Progress, before: float, share: float, of_schedule: float) -> None:
     progress("fitting", before + share * of_schedule)
-
-
-def _check(cloud: PointCloud) -> None:
-    if not (np.isfinite(cloud.points).all() and np.isfinite(cloud.normals).all()):
-        raise InputError(
-            "the cloud holds values that are not numbers; repair the file or scan again"
-        )
-    if len(cloud) < MIN_POINTS:
-        raise InputError(f"the cloud has {len(cloud)} points; a body needs {MIN_POINTS}")
-    height_m = float(np.ptp(cloud.points[:, 2]))
-    if not POSSIBLE_HEIGHTS_M[0] < height_m < POSSIBLE_HEIGHTS_M[1]:
-        raise InputError(
-            f"the cloud is {height_m:.2f} m high; a standing adult in metres, z up, was expected: "
-            "scan the whole person, from the soles to the top of the head"
-        )

@@ -94,9 +94,14 @@ def _cell_of(point, low, cell):  # type: ignore[no-untyped-def]  # pragma: no co
 
 
 @numba.njit(cache=True, nogil=True)
-def _crossing_pairs(corners, lows, highs, faces, tested):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Crossing pairs of triangles that are sorted by their lowest heights."""
-    count = len(corners)
+def _filed(lows, highs):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Boxes, sorted by their lowest heights, filed by the vertical columns that they are in.
+
+    Returns:
+        the first column (n, 2) of each box; where each bucket of columns starts; and of each entry
+        the box, its column (x, y) and the box' ends.
+    """
+    count = len(lows)
     extent = 0.0
     for k in range(count):
         for c in range(2):
@@ -139,8 +144,15 @@ def _crossing_pairs(corners, lows, highs, faces, tested):  # type: ignore[no-unt
         if not filling:
             for bucket in range(buckets):
                 start[bucket + 1] += start[bucket]
+    return first, start, triangle, columns, boxes
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossing_pairs(corners, lows, highs, faces, tested):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Crossing pairs of triangles that are sorted by their lowest heights."""
+    first, start, triangle, columns, boxes = _filed(lows, highs)
     pairs = []
-    for bucket in range(buckets):
+    for bucket in range(len(start) - 1):
         for i in range(start[bucket], start[bucket + 1]):
             a = triangle[i]
             for j in range(i + 1, start[bucket + 1]):
