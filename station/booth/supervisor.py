@@ -132,28 +132,34 @@ class _Child:
                 self.process.wait()
             return
         if self.process is not None:
-            self._failures = 0 if now_s - self._started_s > _CALM_S else self._failures + 1
-            pause_s = _BACK_OFF_S[min(self._failures, len(_BACK_OFF_S) - 1)]
-            self._next_s = now_s + pause_s
-            click.echo(
-                f"{self.service.name} ended with code {self.process.returncode}; "
-                f"restarting it in {pause_s:g} s",
-                err=True,
-            )
+            self._put_off(now_s, f"ended with code {self.process.returncode}")
             self.process = None
         if now_s >= self._next_s:
             self._started_s = now_s
             self.watch.begin()
-            self.process = subprocess.Popen(
-                self._command,
-                stdin=subprocess.DEVNULL,
-                env={
-                    **os.environ,
-                    "NOTIFY_SOCKET": self.watch.path,
-                    "WATCHDOG_USEC": str(int(1e6 * WATCHDOG_S)),
-                },
-                preexec_fn=partial(die_with_parent, os.getpid()),
-            )
+            try:
+                self._start()
+            except OSError as error:
+                # Too many processes, or too little memory: no reason to end the others.
+                self._put_off(now_s, f"cannot be started ({error.strerror or error})")
+
+    def _put_off(self, now_s: float, why: str) -> None:
+        self._failures = 0 if now_s - self._started_s > _CALM_S else self._failures + 1
+        pause_s = _BACK_OFF_S[min(self._failures, len(_BACK_OFF_S) - 1)]
+        self._next_s = now_s + pause_s
+        click.echo(f"{self.service.name} {why}; restarting it in {pause_s:g} s", err=True)
+
+    def _start(self) -> None:
+        self.process = subprocess.Popen(
+            self._command,
+            stdin=subprocess.DEVNULL,
+            env={
+                **os.environ,
+                "NOTIFY_SOCKET": self.watch.path,
+                "WATCHDOG_USEC": str(int(1e6 * WATCHDOG_S)),
+            },
+            preexec_fn=partial(die_with_parent, os.getpid()),
+        )
 
     def stop(self) -> None:
         if self.process is not None and self.process.poll() is None:
