@@ -29,6 +29,7 @@ import re
 import secrets
 import shutil
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -49,6 +50,8 @@ ScanId = NewType("ScanId", str)
 SCAN_ID = r"[A-Za-z0-9_-]{1,64}"
 _SCAN_ID = re.compile(SCAN_ID)
 _MAX_NOTE_BYTES = 1 << 16
+_WRITTEN_S = 3600.0
+"""Time after which nobody writes a note any more; it takes milliseconds."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 STATES = ("queue", "work", "outbox", "failed", "done")
@@ -147,6 +150,13 @@ class Notes:
 
     def remove(self, scan_id: ScanId) -> None:
         self.path(scan_id).unlink(missing_ok=True)
+
+    def sweep(self) -> None:
+        """Remove what killed writers left beside the notes: it bears a scan's label, too."""
+        for entry in entries_of(self.folder):
+            with suppress(OSError):
+                if entry.name[0] == "." and time.time() - entry.stat().st_mtime > _WRITTEN_S:
+                    delete(entry)
 
     def ids(self) -> list[ScanId]:
         """The ids of all scans that have a note."""

@@ -190,6 +190,7 @@ class Spool(ScanFolders):
             shutil.rmtree(entry, ignore_errors=True)
             with contextlib.suppress(OSError):
                 delete(entry)
+        self.notes.sweep()
 
     def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from station.core.errors import SpoolError
-from station.core.scans import ScanId, failure_reason
+from station.core.scans import ScanId, ScanNote, failure_reason
 from station.core.spool import MAX_DEATHS, Spool
 
 
@@ -279,6 +279,18 @@ def test_an_interrupted_deletion_leaves_no_part_in_place(
             spool.remove(spool.path("queue", "a"))
     assert spool.where("a") is None
     assert spool.claim() is None
+
+
+def test_a_note_that_was_cut_short_does_not_stay(tmp_path: Path) -> None:
+    """Its label outlived the scan, for no retention period applied to it."""
+    spool = Spool(tmp_path / "spool")
+    old, fresh = (spool.notes.folder / f".{name}.json.0a1b2c3d.tmp" for name in ("a", "b"))
+    for path in (old, fresh):
+        path.write_text('{"label": "Order 1"}')
+    os.utime(old, (1.8e9, 1.7e9))
+    spool.notes.write(ScanNote(ScanId("c"), "armed"), durable=False)
+    spool.sweep()
+    assert {path.name for path in spool.notes.folder.iterdir()} == {fresh.name, "c.json"}
 
 
 def test_a_spool_in_two_file_systems_is_refused_before_a_scan(tmp_path: Path) -> None:
