@@ -22,6 +22,7 @@ from station.calibration.drift.kept import problem_in_words
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
+from station.core.files import Version, version_of
 from station.core.rig import Rig
 from station.core.scans import CANCELLED, STATES, count_scans, failure_reason
 from station.core.service import NOTHING_RUNS, read_health
@@ -153,7 +154,7 @@ def unusable(config: BoothConfig) -> str:
     """Words on a calibration that no scan can be taken with; empty if it is sound."""
     path = config.calibration
     try:
-        calibrated = _calibrated(path, _version(path))
+        calibrated = _calibrated(path, version_of(path))
     except FileNotFoundError:
         return "the booth is not calibrated, and takes no scans: run station calibrate"
     except (BoothError, OSError) as error:
@@ -161,17 +162,8 @@ def unusable(config: BoothConfig) -> str:
     return mismatch(calibrated, configured_serials(config.cameras))
 
 
-_Version = tuple[int, int, int]
-
-
-def _version(path: Path) -> _Version:
-    """Inode, time and size of a file, which tell whether it has to be read again."""
-    file = path.stat()
-    return file.st_ino, file.st_mtime_ns, file.st_size
-
-
 @lru_cache(maxsize=1)
-def _calibrated(path: Path, version: _Version) -> dict[str, str]:  # noqa: ARG001
+def _calibrated(path: Path, version: Version) -> dict[str, str]:  # noqa: ARG001
     """Cameras of a calibration and their serial numbers.
 
     Asked for every second, and read only when the file is another version of it.
@@ -182,13 +174,13 @@ def _calibrated(path: Path, version: _Version) -> dict[str, str]:  # noqa: ARG00
 def _changed(path: Path, config: BoothConfig) -> bool:
     """Whether a booth.toml says something else than the booth that runs goes by."""
     try:
-        return _read(path, _version(path)) != config
+        return _read(path, version_of(path)) != config
     except (BoothError, OSError):
         return True
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, version: _Version) -> BoothConfig:  # noqa: ARG001
+def _read(path: Path, version: Version) -> BoothConfig:  # noqa: ARG001
     """A booth.toml, read only when the file is another version of it."""
     return load_config(path)
 

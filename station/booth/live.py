@@ -13,6 +13,7 @@ from station.booth.frameset import Frameset
 from station.core.bundle import LEAST_READINGS
 from station.core.config import Volume
 from station.core.errors import BoothError
+from station.core.files import Version, version_of
 from station.core.lens import rays
 from station.core.rig import Rig
 from station.messaging.intake import LiveFrame
@@ -59,7 +60,7 @@ class LiveCloud:
     def __init__(self, calibration: Path, rate_hz: float) -> None:
         self._calibration, self._period_s = calibration, 1.0 / rate_hz
         self._last_s = self._looked_s = -1e9
-        self._file = (0, 0)
+        self._version: Version | None = None
         self.rig: Rig | None = None
 
     def points(self, found: Frameset[LiveFrame], now_s: float) -> NDArray[np.float32] | None:
@@ -78,10 +79,9 @@ class LiveCloud:
     def _look(self) -> None:
         """Load the calibration if its file is another one than before."""
         try:
-            status = self._calibration.stat()
-            file = status.st_ino, status.st_mtime_ns
-            if file != self._file:
+            version = version_of(self._calibration)
+            if version != self._version:
                 self.rig = Rig.load(self._calibration)
-                self._file = file
+                self._version = version
         except (BoothError, OSError):
             return

@@ -139,6 +139,19 @@ def entries_of(folder: Path) -> list[Path]:
         return []
 
 
+Version = tuple[int, int, int]
+
+
+def version_of(path: Path) -> Version:
+    """Inode, time and size of a file, which tell whether it has to be read again.
+
+    Raises:
+        OSError: it is not there, or cannot be looked at.
+    """
+    file = path.stat()
+    return file.st_ino, file.st_mtime_ns, file.st_size
+
+
 def disk_words(error: OSError) -> str:
     """Words on a refusal of the disk, with its place and the remedy."""
     return (

@@ -16,6 +16,7 @@ import zmq
 from station.console.live.picture import PictureMaker
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
+from station.core.files import Version, version_of
 from station.core.rig import Rig
 from station.messaging.messages import FrameHeader
 from station.messaging.transport import subscriber
@@ -37,7 +38,7 @@ class Pictures:
         self._wanted = threading.Event()
         self._stop = threading.Event()
         self._makers: dict[str, PictureMaker] = {}
-        self._calibrated_ns = -1
+        self._version: Version | None = None
         self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
 
     def start(self) -> None:
@@ -122,12 +123,12 @@ class Pictures:
     def _follow_calibration(self) -> None:
         """Use the calibration that is in use now."""
         path: Path = self._config.calibration
-        changed = path.stat().st_mtime_ns if path.exists() else 0
-        if changed == self._calibrated_ns:
+        version = version_of(path) if path.exists() else None
+        if self._makers and version == self._version:
             return
-        self._calibrated_ns = changed
+        self._version = version
         try:
-            known = Rig.load(path).cameras if changed else {}
+            known = {} if version is None else Rig.load(path).cameras
         except BoothError as error:
             self._log.warning("pictures are drawn without a calibration: %s", error)
             known = {}
