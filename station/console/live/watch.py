@@ -64,7 +64,6 @@ class Watch:
         self._problem = ""
         self._round_s = time.monotonic()
         self._rate_hz: float | None = None
-        self._framesets: tuple[int, float] | None = None
         self._seen: dict[str, str] | None = None
         self._spool_ns: tuple[int, ...] = ()
         self._stop = threading.Event()
@@ -227,21 +226,13 @@ class Watch:
                 self._set_fault(str(error))
 
     def _take_status(self, status: dict[str, Any]) -> None:
-        now_s, count = time.monotonic(), status.get("sync", {}).get("framesets")
-        changed = status.get("streaming") != self._status.get("streaming")
+        rate_hz = status.get("sync", {}).get("framesets_hz")
+        before = self._rate_hz, self._status.get("streaming")
         self._status = status
-        if count is None:
-            self._framesets = None
-            return
-        if self._framesets is not None and count >= self._framesets[0]:
-            before, before_s = self._framesets
-            rate_hz = round((count - before) / (now_s - before_s), 1)
-            if rate_hz != self._rate_hz or changed:
-                self._rate_hz = rate_hz
-                self._events.append(
-                    "framesets", {"rate_hz": rate_hz, "streaming": status["streaming"]}
-                )
-        self._framesets = (count, now_s)
+        self._rate_hz = None if rate_hz is None else round(rate_hz, 1)
+        if self._rate_hz is not None and (self._rate_hz, status.get("streaming")) != before:
+            told = {"rate_hz": self._rate_hz, "streaming": status["streaming"]}
+            self._events.append("framesets", told)
 
     def _set_fault(self, fault: str) -> None:
         if fault != self._fault:
