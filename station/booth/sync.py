@@ -274,6 +274,10 @@ class SyncProcess:
         if self._order is not None and self._order.scan_id == scan_id:
             self._cancelled.add(scan_id)
             return Reply(ok=True)
+        if scan_id in self._writing:
+            return Reply(
+                ok=False, error=f"scan {scan_id} is being stored: it is too late to cancel"
+            )
         collection = self._collection
         if collection is None or collection.order.scan_id != scan_id:
             return Reply(ok=False, error=f"scan {scan_id} is not being taken")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from station.booth.collection import Order
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
@@ -389,6 +391,24 @@ def test_status_shows_framesets_per_second(
     sync = SyncProcess(config, logging.getLogger("sync"))
     try:
         assert sync._health()["framesets_hz"] == 0.0
+    finally:
+        sync._writer.close()
+        sync._context.destroy(linger=0)
+
+
+def test_a_scan_that_is_being_stored_is_told_as_such_when_it_is_cancelled(
+    config: BoothConfig,
+) -> None:
+    """It was said not to be taken, while status had it."""
+    sync = SyncProcess(config, logging.getLogger("sync"))
+    try:
+        scan_id = scan_id_of("one")
+        sync._writing[scan_id] = Order(scan_id, "", math.inf)
+        reply = sync._cancel(scan_id)
+        assert (reply.ok, reply.error) == (
+            False,
+            "scan one is being stored: it is too late to cancel",
+        )
     finally:
         sync._writer.close()
         sync._context.destroy(linger=0)
