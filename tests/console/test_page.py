@@ -9,6 +9,18 @@ from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view
 from live_console import LiveConsole
 from playwright.sync_api import expect
 
+_NOTE_WORDS = """() => {
+  window.told = [];
+  new MutationObserver(() => {
+    const word = document.querySelector('#stage .word');
+    if (word && word.textContent !== window.told.at(-1)) window.told.push(word.textContent);
+  }).observe(document.getElementById('stage'),
+    {childList: true, subtree: true, characterData: true});
+}"""
+"""Keeps what the scan's ring says, one after the other."""
+_IN_ORDER = ["Hold still", "Storing", "In the queue", "Measuring the body"]
+"""It went back to "Hold still" after the pictures were taken."""
+
 
 def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> None:
     errors: list[str] = []
@@ -19,9 +31,12 @@ def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> N
         four_pictures_move(page, console)
         open_view(page, console, "scan")
         page.fill("#label", "Order 5")
+        page.evaluate(_NOTE_WORDS)
         page.click("#go")
         verdict = page.locator("#verdict")
         expect(verdict).to_be_visible(timeout=5 * LONG_MS)
+        told = [word for word in page.evaluate("window.told") if word in _IN_ORDER]
+        assert told == [word for word in _IN_ORDER if word in told], told
         assert verdict.get_attribute("data-verdict") in ("ok", "rescan"), verdict.inner_text()
         page.click("#open")
         expect(page.locator("h1")).to_have_text("Order 5", timeout=LONG_MS)

@@ -43,6 +43,11 @@ function hold() {
   document.body.dataset.screen = 'hold';
 }
 
+function taken() {
+  screen('hold', h('div', { className: 'say' }, t('person.taken')));
+  document.body.dataset.screen = 'taken';
+}
+
 function free() {
   screen('free', h('div', {}, h('div', { className: 'say' }, t('person.thanks')), h('div', { className: 'sub' }, t('person.leave'))));
   document.body.dataset.screen = 'free';
@@ -62,6 +67,7 @@ listen((kind, data) => {
   if (kind === 'scan') {
     if (data.state === 'countdown') countdown(data.left_s);
     else if (data.state === 'capturing') hold();
+    else if (data.state === 'writing') taken();
     else if (data.state === 'accepted') free();
     else if (data.state === 'failed') again();
   } else if (kind === 'calibration' && data.running && data.countdown_s) countdown(data.countdown_s);

@@ -132,14 +132,18 @@ export async function scan(main, session) {
     const counting = current.state === 'countdown' || current.state === 'armed';
     const share = counting ? (left || 0) / Math.max(1, session.countdown_s)
       : free ? 0.3 : current.framesets / Math.max(1, current.wanted);
-    const words = counting ? String(left || '…') : t({ capturing: 'scan.hold', accepted: 'scan.waiting' }[current.state] || 'scan.working');
+    // All pictures are taken: who asks is told "capturing" until they are stored.
+    const taken = current.state === 'writing'
+      || (current.state === 'capturing' && current.wanted > 0 && current.framesets >= current.wanted);
+    const words = counting ? String(left || '…') : t(taken ? 'scan.storing'
+      : { capturing: 'scan.hold', accepted: 'scan.waiting' }[current.state] || 'scan.working');
     done.setAttribute('stroke-dashoffset', AROUND * (1 - share));
     ring.classList.toggle('busy', free);
     word.className = counting ? 'number' : 'word';
     if (word.textContent !== words) word.textContent = words;
     leave.hidden = !free;
     below.hidden = !counting;
-    give.hidden = current.state === 'reconstructing';
+    give.hidden = taken || current.state === 'reconstructing';
   }
 
   async function giveUp(event) {
