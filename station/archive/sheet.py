@@ -23,7 +23,15 @@ from station.archive.figure import Line, View, draw_views, heading_rad
 from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.archive.surfaces import read_mesh
-from station.archive.tables import DIGITS, Pose, Unit, read_measurements, rows, side_differences
+from station.archive.tables import (
+    DIGITS,
+    MARKS,
+    Pose,
+    Unit,
+    read_measurements,
+    rows,
+    side_differences,
+)
 from station.core.words.terms import Language
 
 _WIDTH, _HEIGHT = A4
@@ -44,11 +52,14 @@ _WORDS: dict[Language, dict[str, str]] = {
            "difference": "left - right",
            "note": "± half the 95 % interval. Lines are drawn where they were measured. "
            "Differences of the sides in bold are larger than their interval.",
+           "marks": "* the cameras saw only a part of this line; ** they saw hardly any of it: "
+           "it is inferred.",
            "unlabelled": "no label"},
     "zh": {"front": "正面", "left": "左侧", "back": "背面", "as-scanned": "扫描姿势",
            "standard": "标准姿势", "value": "数值", "l": "左", "r": "右",
            "difference": "左 - 右",
            "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。粗体的左右差值超出其区间。",
+           "marks": "* 相机只看到这条线的一部分；** 几乎没有看到，为推算值。",
            "unlabelled": "无订单"},
 }  # fmt: skip
 _LATIN, _BOLD, _CHINESE, _OTHER = "Helvetica", "Helvetica-Bold", "STSong-Light", "Other"
@@ -67,8 +78,8 @@ class _Entry:
     number: int
     words: str
     names: tuple[str, ...]
-    values: tuple[tuple[str, float | None, float], ...]
-    """(side, value, half of the interval); no value where the row is blank."""
+    values: tuple[tuple[str, float | None, float, str], ...]
+    """(side, value, half of the interval, mark of its basis); no value where the row is blank."""
     difference: tuple[float, bool] | None
     """Left less right, and whether it is more than its interval."""
 
@@ -89,7 +100,9 @@ def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: 
     _head(canvas, scan, pose, unit, language)
     _figures(canvas, views, entries, language)
     _table(canvas, entries, unit, language)
-    _text(canvas, _MARGIN, 24, _WORDS[language]["note"], 7, _GREY)
+    _text(canvas, _MARGIN, 28, _WORDS[language]["note"], 7, _GREY)
+    if any(mark for entry in entries for *_, mark in entry.values):
+        _text(canvas, _MARGIN, 18, _WORDS[language]["marks"], 7, _GREY)
     canvas.showPage()
     canvas.save()
     return stream.getvalue()
@@ -108,7 +121,7 @@ def _entries(
             number,
             words,
             tuple(row["name"] for row in group),
-            tuple((row["side"], row["value"], _half(row)) for row in group),
+            tuple((row["side"], row["value"], _half(row), _mark(row)) for row in group),
             next((known[row["name"]] for row in group if row["name"] in known), None),
         )
         for number, (words, group) in enumerate(grouped.items(), start=1)
@@ -117,6 +130,10 @@ def _entries(
 
 def _half(row: dict[str, Any]) -> float:
     return 0.0 if row["value"] is None else (row["high"] - row["low"]) / 2
+
+
+def _mark(row: dict[str, Any]) -> str:
+    return MARKS[row["basis"]][0] if row["basis"] in MARKS else ""
 
 
 def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: Language) -> None:
@@ -262,13 +279,14 @@ def _table(canvas: Canvas, entries: Sequence[_Entry], unit: Unit, language: Lang
                 text = f"{less:+.{digits}f}"
                 right = left + width - _DIFFERENCE
                 _text(canvas, right - _width(text, 6.8, real), y, text, 6.8, _INK, real)
-            for side, value, around in entry.values:
+            for side, value, around, mark in entry.values:
                 right = left + width - (2 if side == "right" else 92)
                 if value is None:
                     _text(canvas, right - 28 - _width("–", 8.2, True), y, "–", 8.2, _GREY, True)
                     continue
                 about = f"± {around:.{digits}f}"
                 _text(canvas, right - _width(about, 6.2), y, about, 6.2, _GREY)
+                _text(canvas, right + 1, y, mark, 6.2, _INK)
                 text = f"{value:.{digits}f}"
                 _text(canvas, right - 28 - _width(text, 8.2, True), y, text, 8.2, _INK, True)
 

@@ -33,7 +33,7 @@ _WORDS = {
     "zh": {"ok": "合格", "rescan": "请重新扫描", "as-scanned": "扫描姿势", "standard": "标准姿势",
            "left": "左", "right": "右"},
 }  # fmt: skip
-_MARKS = {
+MARKS = {
     "partly": ("*", "the cameras saw only a part of this line"),
     "inferred": ("**", "the cameras saw hardly any of this line; it is inferred"),
 }
@@ -103,7 +103,7 @@ def printed_table(document: dict[str, Any]) -> list[str]:
     if len(both) > 1:
         lines += ["", *both]
     used = {row["basis"] for row in listed}
-    notes = [f"{mark} {words}" for basis, (mark, words) in _MARKS.items() if basis in used]
+    notes = [f"{mark} {words}" for basis, (mark, words) in MARKS.items() if basis in used]
     return [*lines, "", *notes] if notes else lines
 
 
@@ -111,7 +111,7 @@ def _printed(row: dict[str, Any]) -> str:
     """A value with its interval; a mark where the cameras did not see all of the line."""
     if row["value"] is None:
         return f"{'-':>7}  not measured"
-    mark = _MARKS[row["basis"]][0] if row["basis"] in _MARKS else ""
+    mark = MARKS[row["basis"]][0] if row["basis"] in MARKS else ""
     return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f} {mark:<2}"
 
 

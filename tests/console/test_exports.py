@@ -7,6 +7,7 @@ import hashlib
 import hmac
 import io
 import json
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -107,6 +108,9 @@ def test_the_sheet_has_the_whole_table_on_one_page(
     for row in rows(read_measurements(folder, "standard"), "cm", "en"):
         assert row["words"] in text
         assert row["value"] is None or f"{row['value']:.1f}" in text
+    # A tailor must see which values the cameras did not.
+    assert "it is inferred" in text
+    assert re.search(r"± \d\.\d\s*\*\*", text)
     chinese = sheet_pdf(scan, folder, "as-scanned", "in", "zh")
     assert len(pypdf.PdfReader(io.BytesIO(chinese)).pages) == 1
 
