@@ -246,6 +246,7 @@ def test_a_backup_makes_another_machine_the_same_booth(
     machine: Machine, base: Path, package: Path, tmp_path: Path
 ) -> None:
     machine.run("systemctl", "stop", "booth.target")
+    machine.run("mkdir", "/root/usb")
     machine.run("station", "backup", "/root/usb", "--with-scans")
     other = Machine(base, tmp_path / "other")
     try:

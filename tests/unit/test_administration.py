@@ -21,7 +21,7 @@ from station.administration.restore import _protect, restore
 from station.administration.setup import compare_sensors, setup
 from station.core import bundle, rig
 from station.core.config_file import load_config
-from station.core.errors import BoothError, ConfigError, FormatError
+from station.core.errors import BoothError, ConfigError, FormatError, InputError
 from station.core.files import held
 from station.core.rig import Rig
 from station.core.service import STATION_LOCK
@@ -207,6 +207,23 @@ def test_what_was_saved_comes_back_on_another_machine(
     other = tmp_path / "other/booth.toml"
     _run(restore, saved, "--config", other)
     assert _content(other.parent) == expected
+
+
+def test_a_backup_goes_to_a_drive_that_is_there_and_says_what_it_lacks(
+    booth: Path, tmp_path: Path
+) -> None:
+    """It was made on the system's disk where the drive was not mounted, without the webhook's key,
+    and both showed too late."""
+    orders = '\n[[deliver]]\nname = "orders"\nurl = "https://x"\nsecret_file = "orders.secret"\n'
+    booth.write_text(booth.read_text() + orders)
+    drive = tmp_path / "usb"
+    with pytest.raises(InputError, match="is no folder; is the drive mounted"):
+        _run(backup, drive, "--config", booth)
+    assert not drive.exists()
+    drive.mkdir()
+    done = CliRunner().invoke(backup, [str(drive), "--config", str(booth)])
+    assert done.exit_code == 0, done.output
+    assert f"deliver orders is not in it: keep {booth.parent / 'orders.secret'}" in done.output
 
 
 def test_a_disk_without_file_modes_takes_a_backup(
