@@ -20,6 +20,7 @@ from live_console import API, LiveConsole
 
 from station.archive.surfaces import read_mesh
 from station.core.rig import Rig
+from station.handover.ledger import Ledger, Waiting
 
 README = Path(__file__).parents[2] / "README.md"
 
@@ -114,6 +115,18 @@ def test_the_same_key_never_scans_twice(console: LiveConsole, scans: list[dict[s
         reused = client.post("/scans", json={"label": "other"}, headers={"Idempotency-Key": "k-1"})
         _problem(reused, 422, "idempotency-key-reused")
     assert scans
+
+
+def test_a_target_that_is_no_longer_configured_waits_for_nothing(console: LiveConsole) -> None:
+    """The page told of its failures for ever."""
+    ledger = Ledger(console.config.spool.folder)
+    ledger.keep(Waiting("gone", "scan-1", error="answers 500"))
+    try:
+        assert [one.target for one in ledger.waiting()] == ["gone"]
+        with console.client("read") as client:
+            assert client.get("/booth").json()["waiting_deliveries"] == []
+    finally:
+        shutil.rmtree(console.config.spool.folder / "handover" / "gone", ignore_errors=True)
 
 
 def test_a_countdown_can_be_cancelled(console: LiveConsole) -> None:

@@ -138,11 +138,15 @@ def _session(console: Console, caller: Caller | None) -> Session:
 def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
     """Cameras with their remedies, framesets, spool, disk, calibration, hand-overs."""
     ledger = Ledger(console.config.spool.folder)
+    # Whom booth.toml no longer names is waited for by nobody.
+    targets = {target.name for target in console.config.deliver}
     return BoothState(
         **console.watch.booth(),
         calibration=_calibration_in_use(console),
         last_check=_last_check(console),
-        waiting_deliveries=[Delivery(**entry.document()) for entry in ledger.waiting()],
+        waiting_deliveries=[
+            Delivery(**entry.document()) for entry in ledger.waiting() if entry.target in targets
+        ],
     )
 
 

@@ -70,9 +70,11 @@ export async function booth(main) {
     showTroubles(state);
     const last = state.last_check;
     checkText.textContent = last === null ? t('booth.never') : `${time(last.time)} – ${checked(last)}`;
-    deliveries.hidden = state.waiting_deliveries.length === 0;
+    const waiting = state.waiting_deliveries;
+    deliveries.hidden = waiting.length === 0;
     deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
-      ...state.waiting_deliveries.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${said(one.error)}` : ''}`)));
+      ...waiting.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${said(one.error)}` : ''}`)),
+      waiting.length > 8 ? h('p', { className: 'small' }, t('booth.moreWaiting', { n: waiting.length - 8 })) : '');
   }
 
   async function refresh() {
