@@ -25,9 +25,10 @@ from station.archive.records import ScanRecord
 from station.archive.surfaces import read_mesh
 from station.archive.tables import (
     DIGITS,
-    MARKS,
     Pose,
     Unit,
+    mark_of,
+    notes_on_marks,
     read_measurements,
     rows,
     side_differences,
@@ -52,14 +53,11 @@ _WORDS: dict[Language, dict[str, str]] = {
            "difference": "left - right",
            "note": "± half the 95 % interval. Lines are drawn where they were measured. "
            "Differences of the sides in bold are larger than their interval.",
-           "marks": "* the cameras saw only a part of this line; ** they saw hardly any of it: "
-           "it is inferred.",
            "unlabelled": "no label"},
     "zh": {"front": "正面", "left": "左侧", "back": "背面", "as-scanned": "扫描姿势",
            "standard": "标准姿势", "value": "数值", "l": "左", "r": "右",
            "difference": "左 - 右",
            "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。粗体的左右差值超出其区间。",
-           "marks": "* 相机只看到这条线的一部分；** 几乎没有看到，为推算值。",
            "unlabelled": "无订单"},
 }  # fmt: skip
 _LATIN, _BOLD, _CHINESE, _OTHER = "Helvetica", "Helvetica-Bold", "STSong-Light", "Other"
@@ -92,7 +90,8 @@ def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: 
     """
     drawn = read_measurements(folder, "as-scanned")["measurements"]
     table = read_measurements(folder, pose)
-    entries = _entries(rows(table, unit, language), side_differences(table, unit, language))
+    listed = rows(table, unit, language)
+    entries = _entries(listed, side_differences(table, unit, language))
     views = draw_views(read_mesh(folder / "mesh.ply"), drawn, heading_rad(folder))
     stream = io.BytesIO()
     canvas = Canvas(stream, pagesize=A4, invariant=True)
@@ -101,8 +100,7 @@ def sheet_pdf(scan: ScanRecord, folder: Path, pose: Pose, unit: Unit, language: 
     _figures(canvas, views, entries, language)
     _table(canvas, entries, unit, language)
     _text(canvas, _MARGIN, 28, _WORDS[language]["note"], 7, _GREY)
-    if any(mark for entry in entries for *_, mark in entry.values):
-        _text(canvas, _MARGIN, 18, _WORDS[language]["marks"], 7, _GREY)
+    _text(canvas, _MARGIN, 18, "   ".join(notes_on_marks(listed, language)), 7, _GREY)
     canvas.showPage()
     canvas.save()
     return stream.getvalue()
@@ -121,7 +119,7 @@ def _entries(
             number,
             words,
             tuple(row["name"] for row in group),
-            tuple((row["side"], row["value"], _half(row), _mark(row)) for row in group),
+            tuple((row["side"], row["value"], _half(row), mark_of(row)) for row in group),
             next((known[row["name"]] for row in group if row["name"] in known), None),
         )
         for number, (words, group) in enumerate(grouped.items(), start=1)
@@ -130,10 +128,6 @@ def _entries(
 
 def _half(row: dict[str, Any]) -> float:
     return 0.0 if row["value"] is None else (row["high"] - row["low"]) / 2
-
-
-def _mark(row: dict[str, Any]) -> str:
-    return MARKS[row["basis"]][0] if row["basis"] in MARKS else ""
 
 
 def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: Language) -> None:

@@ -33,10 +33,12 @@ _WORDS = {
     "zh": {"ok": "合格", "rescan": "请重新扫描", "as-scanned": "扫描姿势", "standard": "标准姿势",
            "left": "左", "right": "右"},
 }  # fmt: skip
-MARKS = {
-    "partly": ("*", "the cameras saw only a part of this line"),
-    "inferred": ("**", "the cameras saw hardly any of this line; it is inferred"),
-}
+_MARKS: dict[str, tuple[str, dict[Language, str]]] = {
+    "partly": ("*", {"en": "the cameras saw only a part of this line",
+                     "zh": "相机只看到这条线的一部分"}),
+    "inferred": ("**", {"en": "the cameras saw hardly any of this line; it is inferred",
+                        "zh": "相机几乎没有看到这条线，为推算值"}),
+}  # fmt: skip
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -102,17 +104,26 @@ def printed_table(document: dict[str, Any]) -> list[str]:
     ]
     if len(both) > 1:
         lines += ["", *both]
-    used = {row["basis"] for row in listed}
-    notes = [f"{mark} {words}" for basis, (mark, words) in MARKS.items() if basis in used]
+    notes = notes_on_marks(listed, "en")
     return [*lines, "", *notes] if notes else lines
+
+
+def mark_of(row: dict[str, Any]) -> str:
+    """Mark of a row of whose line the cameras did not see all; empty for others."""
+    return _MARKS[row["basis"]][0] if row["basis"] in _MARKS else ""
+
+
+def notes_on_marks(listed: list[dict[str, Any]], language: Language) -> list[str]:
+    """Meanings of the marks of these rows, one sentence each."""
+    used = {row["basis"] for row in listed}
+    return [f"{mark} {words[language]}" for basis, (mark, words) in _MARKS.items() if basis in used]
 
 
 def _printed(row: dict[str, Any]) -> str:
     """A value with its interval; a mark where the cameras did not see all of the line."""
     if row["value"] is None:
         return f"{'-':>7}  not measured"
-    mark = MARKS[row["basis"]][0] if row["basis"] in MARKS else ""
-    return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f} {mark:<2}"
+    return f"{row['value']:7.1f}  {row['low']:5.1f} to {row['high']:5.1f} {mark_of(row):<2}"
 
 
 def side_differences(
