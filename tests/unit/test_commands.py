@@ -226,6 +226,19 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
     assert told == f"stopped; {out} is incomplete (some): delete it before you record there again\n"
 
 
+def _listening(modules: Path, *arguments: str) -> subprocess.Popen[str]:
+    """A Python process that hears Ctrl-C and finds the modules of a folder first."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        env={**os.environ, "PYTHONPATH": str(modules)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heard,
+    )
+
+
 @pytest.mark.parametrize(
     ("module", "command"),
     [
@@ -248,14 +261,7 @@ def test_a_command_that_is_interrupted_while_it_loads_is_silent(
     """Ctrl-C in the first half second showed a traceback."""
     source = "import time\nprint('loads', flush=True)\ntime.sleep(60)\n"
     (tmp_path / f"{module}.py").write_text(source)
-    with subprocess.Popen(
-        [sys.executable, *command],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heard,
-    ) as starting:
+    with _listening(tmp_path, *command) as starting:
         assert starting.stdout is not None
         assert starting.stdout.readline() == "loads\n"
         starting.send_signal(signal.SIGINT)
@@ -272,15 +278,8 @@ def test_a_command_that_is_interrupted_is_silent(tmp_path: Path, waits: str) -> 
     )
     (tmp_path / "slow.py").write_text(source)
     group = "run(LazyGroup(lazy={'it': ('slow:it', '')}))"
-    with subprocess.Popen(
-        [sys.executable, "-c", f"from station.core.commands import *; {group}", "it"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heard,
-    ) as working:
+    words = f"from station.core.commands import *; {group}"
+    with _listening(tmp_path, "-c", words, "it") as working:
         assert working.stdout is not None
         assert working.stdout.readline() == "works\n"
         time.sleep(0.5)
