@@ -19,6 +19,7 @@ from typing import Any
 from station.booth.collection import check_words, silence_in_words
 from station.booth.supervisor import services
 from station.calibration.drift.kept import problem_in_words
+from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
@@ -156,7 +157,7 @@ def unusable(config: BoothConfig) -> str:
     try:
         calibrated = _calibrated(path, version_of(path))
     except FileNotFoundError:
-        return "the booth is not calibrated, and takes no scans: run station calibrate"
+        return CalibrationStore(config.calibrate.folder, path).missing_words()
     except (BoothError, OSError) as error:
         return str(error)
     return mismatch(calibrated, configured_serials(config.cameras))

@@ -18,6 +18,7 @@ from typing import TypeVar
 from station.booth.collection import LATE, Collection, Order
 from station.calibration.drift.motion import CameraMove, depths_words
 from station.calibration.drift.watch import DriftWatch
+from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, CalibrationError
@@ -283,7 +284,7 @@ def booth_rig(config: BoothConfig) -> Rig:
     Raises:
         BoothError: it is not, or cannot be read.
     """
-    rig = Rig.load(config.calibration)
+    rig = CalibrationStore(config.calibrate.folder, config.calibration).rig_in_use()
     if words := mismatch(calibrated_serials(rig.cameras), configured_serials(config.cameras)):
         raise CalibrationError(words)
     return rig

@@ -247,6 +247,7 @@ def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> No
         "station calibrate --new begins another": "“Start over” begins another",
         "or run station calibrate": "or run “All remaining steps”",
         "station calibrate ballast": "“All remaining steps” ballast",
+        "with station calibrate --use 20261120T100000Z": "with “Use” 20261120T100000Z",
     }
     said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
     assert said == list(texts.values())

@@ -21,7 +21,10 @@ from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
 from station.booth.operator import asking, status_cli
+from station.booth.scan_writer import booth_rig
 from station.booth.sync import SyncProcess
+from station.calibration.drift.check_cli import check
+from station.calibration.guide.calibrate_cli import calibrate
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
@@ -89,6 +92,26 @@ def test_a_booth_that_is_not_calibrated_says_so(config: BoothConfig) -> None:
     config.calibration.unlink()
     [problem] = _problems(config, streaming=True, silent=[], cameras={})
     assert problem.endswith("takes no scans: run station calibrate")
+
+
+def test_a_lost_calibration_is_replaced_by_the_newest_that_is_kept(config: BoothConfig) -> None:
+    """Status, a scan and a check asked for another calibration, which takes an hour."""
+    path = config.calibration.parent / "booth.toml"
+    for day in ("20261119", "20261120"):
+        kept = config.calibrate.folder / f"{day}T100000Z" / "calibration.json"
+        kept.parent.mkdir(parents=True)
+        kept.write_bytes(config.calibration.read_bytes())
+    config.calibration.unlink()
+    [words] = _problems(config, streaming=True, silent=[], cameras={})
+    assert "put the newest calibration back with station calibrate --use 20261120T100000Z" in words
+    with pytest.raises(BoothError) as refusal:
+        booth_rig(config)
+    assert str(refusal.value) == words
+    checked = CliRunner().invoke(check, ["--config", str(path)])
+    assert str(checked.exception) == words
+    asked = ["--use", "20261120T100000Z", "--config", str(path)]
+    assert CliRunner().invoke(calibrate, asked).exit_code == 0
+    assert _problems(config, streaming=True, silent=[], cameras={}) == []
 
 
 def test_the_remedy_of_several_silent_cameras_is_said_once(config: BoothConfig) -> None:

@@ -102,9 +102,10 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
         CalibrationError: cameras or sensors are not those of the calibration, or its picture of
             the empty booth lacks one.
     """
-    rig = Rig.load(config.calibration)
+    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    rig = store.rig_in_use()
     _refuse_others(rig, configured_serials(config.cameras))
-    scene = CalibrationStore(config.calibrate.folder, config.calibration).scene()
+    scene = store.scene()
     names = [camera.name for camera in config.cameras]
     missing = [name for name in names if name not in scene]
     if missing:

@@ -64,7 +64,7 @@ def use_correction(config: BoothConfig, created: str) -> tuple[Drift, Entry]:
     """
     store = CalibrationStore(config.calibrate.folder, config.calibration)
     with store.locked():
-        rig = Rig.load(config.calibration)
+        rig = store.rig_in_use()
         folder, cameras = config.spool.folder / FOLDER, set(rig.cameras)
         used = len(_scans(folder, _names(config), rig.created, cameras))
         if used < ENOUGH:

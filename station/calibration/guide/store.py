@@ -106,6 +106,27 @@ class CalibrationStore:
         """Whether the booth reads a calibration that is none of the stored ones."""
         return self.in_use.exists() and not self.name_in_use()
 
+    def rig_in_use(self) -> Rig:
+        """The calibration that the booth reads.
+
+        Raises:
+            CalibrationError: there is none; names a stored one that could take its place.
+            FormatError: it cannot be used.
+        """
+        if not self.in_use.exists():
+            raise CalibrationError(self.missing_words())
+        return Rig.load(self.in_use)
+
+    def missing_words(self) -> str:
+        """Words on a booth without a calibration in use, and how it gets one."""
+        newest = self.newest()
+        if newest is None:
+            return "the booth is not calibrated, and takes no scans: run station calibrate"
+        return (
+            f"{self.in_use} is missing, and no scans are taken; put the newest calibration back "
+            f"with station calibrate --use {newest} (--list shows all), or run station calibrate"
+        )
+
     def newest(self) -> str | None:
         """Name of the last stored calibration, if there is one."""
         return max((folder.name for folder in self._folders()), default=None)

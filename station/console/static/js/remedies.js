@@ -4,11 +4,11 @@ import { said, t } from './i18n.js';
 
 export const STEPS = ['floor', 'ball', 'mark', 'around', 'stand', 'depth', 'solve'];
 // The word after a command may be the sentence's own.
-const COMMAND = new RegExp(`station calibrate(?: (--new|(?:${STEPS.join('|')})(?![a-z])))?(?: --[a-z]+)*`, 'g');
+const COMMAND = new RegExp(`station calibrate(?: (--new|--use(?! DATE)|(?:${STEPS.join('|')})(?![a-z])))?(?: --[a-z]+)*`, 'g');
 
 export function withButtons(text) {
   return said(text).replace(COMMAND, (_, word) => {
-    const key = word === '--new' ? 'new' : word || 'continue';
+    const key = word ? word.replace('--', '') : 'continue';
     return t('cal.button', { name: t(`cal.${key}`) });
   });
 }
