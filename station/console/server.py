@@ -8,6 +8,7 @@ import logging
 import socket
 import threading
 from collections import Counter
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import uvicorn
@@ -96,6 +97,13 @@ class CountedWebSocket(WebSocketsSansIOProtocol):
         PatientProtocol.release(self.client[0] if self.client else "")
 
 
+class _Server(uvicorn.Server):
+    """uvicorn's server, which leaves signals to the process: streams have to end first."""
+
+    def capture_signals(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
 def check_exposure(config: ConsoleConfig, has_password: bool) -> bool:
     """Whether to speak TLS.
 
@@ -134,7 +142,7 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
     listener = _awaited_listener(console, log, stop)
     if listener is None:
         return
-    server = uvicorn.Server(
+    server = _Server(
         uvicorn.Config(
             create_app(console),
             http=PatientProtocol,
@@ -153,7 +161,6 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
             log_level="warning",
         )
     )
-    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
     threading.Thread(target=_until, args=(stop, server, console), daemon=True).start()
     scheme = "https" if secure else "http"
     log.info("the console is at %s://%s:%d", scheme, config.host, config.port)
@@ -162,7 +169,7 @@ def serve(console: Console, log: logging.Logger, stop: threading.Event) -> None:
 
 def _until(stop: threading.Event, server: uvicorn.Server, console: Console) -> None:
     stop.wait()
-    console.closing.set()
+    console.end_streams()
     server.should_exit = True
 
 

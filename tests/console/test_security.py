@@ -6,8 +6,10 @@ import asyncio
 import json
 import logging
 import os
+import signal
 import socket
 import ssl
+import subprocess
 import threading
 import time
 from datetime import UTC, datetime
@@ -18,7 +20,11 @@ import httpx
 import pytest
 import websockets
 from click.testing import CliRunner
-from live_console import API, PASSWORD, LiveConsole
+from ctrl_c import heard
+from live_console import API, PASSWORD, LiveConsole, free_port
+from running_station import STATION
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from station.console.api.console import Console
 from station.console.security.certificate import make_certificate
@@ -66,6 +72,34 @@ def test_a_console_whose_port_is_taken_says_so_and_waits(tmp_path: Path) -> None
     assert _awaited_listener(console, console.log, stop) is None
     console.vault.close()
     console.audit.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_console_that_is_watched_ends_quietly(tmp_path: Path, number: signal.Signals) -> None:
+    """A page that was open was cut off, with a traceback."""
+    path, port = tmp_path / "booth.toml", free_port()
+    path.write_text(
+        f'[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n[console]\nport = {port}\n'
+    )
+    command = [*STATION, "console", "--config", str(path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as console:
+        assert console.stderr is not None
+        while "the console is at" not in console.stderr.readline():
+            assert console.poll() is None
+        place = f"127.0.0.1:{port}{API}"
+        with (
+            connect(
+                f"ws://{place}/pictures", origin=Origin(f"http://127.0.0.1:{port}")
+            ) as pictures,
+            httpx.stream("GET", f"http://{place}/events", timeout=60.0) as events,
+        ):
+            pictures.send("next")
+            parts = events.iter_raw()
+            assert next(parts).startswith(b"retry")
+            console.send_signal(number)
+            rest = console.stderr.read()
+            assert console.wait(60.0) == 0
+    assert rest == ""
 
 
 def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:

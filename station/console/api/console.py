@@ -71,8 +71,13 @@ class Console:
         self.watch.start()
         self.pictures.start()
 
-    def close(self) -> None:
+    def end_streams(self) -> None:
+        """Let the answers end that go on for ever: uvicorn cuts them off, with a traceback."""
         self.closing.set()
+        self.events.close()
+
+    def close(self) -> None:
+        self.end_streams()
         self.tasks.close()
         self.watch.close()
         self.pictures.close()

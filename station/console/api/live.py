@@ -50,8 +50,6 @@ async def _while_allowed(
 ) -> AsyncIterator[bytes]:
     checked_s = time.monotonic()
     async for part in stream:
-        if console.closing.is_set():
-            return
         if time.monotonic() - checked_s > _RECHECK_S:
             checked_s = time.monotonic()
             try:

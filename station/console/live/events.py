@@ -41,7 +41,7 @@ class EventLog:
     def __init__(self) -> None:
         self.start = secrets.token_hex(4)
         self._events: deque[Event] = deque(maxlen=KEPT)
-        self._number = 0
+        self._number, self._closed = 0, False
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
@@ -57,6 +57,14 @@ class EventLog:
         with self._lock:
             self._number += 1
             self._events.append(Event(self._number, kind, text))
+        self._tell()
+
+    def close(self) -> None:
+        """End all streams; may be called from any thread."""
+        self._closed = True
+        self._tell()
+
+    def _tell(self) -> None:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._wake)
 
@@ -86,12 +94,12 @@ class EventLog:
             return int(number), int(number) + 1 < oldest
 
     async def stream(self, last_id: str, follow: bool = True) -> AsyncIterator[bytes]:
-        """Server-sent events (WHATWG HTML 9.2), for ever, or until there are no more."""
+        """Server-sent events (WHATWG HTML 9.2), until the log is closed or there are no more."""
         number, lost = self._resume(last_id)
         yield b"retry: 1000\n\n"
         if lost:
             yield self._packed(Event(number, "reset", "{}"))
-        while True:
+        while not self._closed:
             news = self._news
             found = self.after(number)
             if found and found[0].number > number + 1 and number:
