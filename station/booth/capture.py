@@ -88,7 +88,8 @@ class CaptureProcess:
         if time.monotonic() < self._open_at_s:
             stop.wait(_READ_TIMEOUT_S)
             return
-        self._state, self._detail = "opening", ""
+        if not self._failures:  # else it stays lost, for the reason that is known
+            self._state, self._detail = "opening", ""
         self._report_health(now=True)
         driver = make_driver(self._camera)
         self._heart.allow(_OPENING_S)

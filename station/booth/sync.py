@@ -308,7 +308,7 @@ class SyncProcess:
                     "clock_resets": health.clock_resets,
                     "silent": name in silent,
                     "last_frame_age_s": now_s - self._intake.last_frame_s.get(name, now_s),
-                    "rate_hz": self._checks[name].rate_hz(),
+                    "rate_hz": None if name in silent else self._checks[name].rate_hz(),
                     "trouble": self._checks[name].trouble(now_s),
                 }
                 for name in self._names

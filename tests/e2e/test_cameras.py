@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 from live_console import free_port
 from running_station import Station
 
@@ -20,9 +21,11 @@ from station.booth.health import booth_health
 from station.booth.supervisor import services
 from station.core.config_file import load_config
 from station.core.errors import BoothError, DriverError
-from station.core.files import held
+from station.core.files import held, private_folder
 from station.core.service import read_health
 from station.core.spool import Spool
+from station.messaging.messages import CameraHealth, DesiredState
+from station.messaging.transport import publisher, subscriber
 from station.sensors.freenect import LIBRARY_VARIABLE, FreenectCamera, FreenectDriver
 from station.sensors.registry import make_driver
 
@@ -45,8 +48,35 @@ def test_a_camera_that_goes_silent_is_named_within_a_second(
     refused = station.command("scan")
     os.kill(victim, signal.SIGCONT)
     assert status["sync"]["silent"] == ["back-lower"]
+    rates = {name: camera["rate_hz"] for name, camera in status["sync"]["cameras"].items()}
+    assert [name for name, rate in rates.items() if rate is None] == ["back-lower"]
     assert refused.returncode == 1
     assert "camera back-lower sends no frames; scan again" in refused.stderr
+
+
+def test_a_camera_that_is_tried_again_keeps_its_reason(tmp_path: Path) -> None:
+    """It was silent without a reason whenever it was tried."""
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "gone"\n')
+    folder = private_folder(load_config(path).runtime.folder)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    wishes = publisher(context, folder, "desired", "desired")
+    reports = subscriber(context, folder, ["camera-a"], ["health"])
+    capture = subprocess.Popen([*STATION, "capture", "a", "--config", str(path)])
+    told: list[tuple[str, bool]] = []
+    try:
+        while told.count(("lost", True)) < 12:
+            wishes.send_multipart([b"desired", DesiredState(True).pack()])
+            while reports.poll(100):
+                health = CameraHealth.unpack(reports.recv_multipart()[-1])
+                told.append((health.state, "gone" in health.detail))
+    finally:
+        capture.terminate()
+        assert capture.wait(60.0) == 0
+        context.destroy(linger=0)
+    known = told.index(("lost", True))
+    assert set(told[:known]) <= {("off", False), ("opening", False)}
+    assert set(told[known:]) == {("lost", True)}
 
 
 def test_an_empty_booth_fails_the_scan_before_the_person_may_leave(

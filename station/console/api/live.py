@@ -11,7 +11,7 @@ from fastapi import APIRouter, Header, Query, Request, WebSocket
 from fastapi.responses import StreamingResponse
 from starlette.websockets import WebSocketDisconnect
 
-from station.console.api.console import Booth, Console, Reader, caller_of, console_of
+from station.console.api.console import Booth, Reader, caller_of, console_of
 from station.console.api.problems import ProblemError, responses
 
 router = APIRouter(tags=["live"])
@@ -41,13 +41,11 @@ async def events(
     follow: Annotated[bool, Query(description="false: existing events only")] = True,
 ) -> StreamingResponse:
     """Events as they happen. With Last-Event-ID a program resumes where it stopped."""
-    stream = _while_allowed(request, console, console.events.stream(last_event_id, follow))
+    stream = _while_allowed(request, console.events.stream(last_event_id, follow))
     return StreamingResponse(stream, media_type="text/event-stream")
 
 
-async def _while_allowed(
-    request: Request, console: Console, stream: AsyncIterator[bytes]
-) -> AsyncIterator[bytes]:
+async def _while_allowed(request: Request, stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
     checked_s = time.monotonic()
     async for part in stream:
         if time.monotonic() - checked_s > _RECHECK_S:
