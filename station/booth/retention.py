@@ -26,6 +26,7 @@ from station.core.errors import SpoolError
 from station.core.files import delete, held, read_bounded_json, write_bytes
 from station.core.scans import STATES, ScanId, boot_id, scan_id_of
 from station.core.spool import Spool
+from station.handover.ledger import Ledger
 
 FILE = "retention.json"
 _LOCK = "retention.lock"
@@ -131,6 +132,8 @@ def _expire(spool: Spool, name: str) -> bool:
     state, scan_id = name.split("/", 1)
     if state != "scans":
         spool.remove(spool.folder / name)
+        if state == "outbox":
+            Ledger(spool.folder).forget(scan_id)
         return True
     if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
         spool.notes.remove(ScanId(scan_id))
@@ -203,6 +206,7 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
                 spool.remove(path)
             else:
                 delete(path)
+        Ledger(spool.folder).forget(name)
         # Whoever removes old scans just now forgets this one, too.
         with suppress(SpoolError), held(spool.folder / _LOCK, _BUSY):
             _save(spool, _load(spool))
@@ -231,28 +235,32 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         raise click.UsageError("give a scan id, --label or --old")
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
+    receivers = list[str]()
     if old:
         removed = expire_old(spool, config.retention)
-    elif scan_id:
-        removed = purge_scan(spool, scan_id)
     else:
-        removed = _purge_label(spool, str(label))
+        scans = [scan_id_of(scan_id)] if scan_id else _labelled(spool, str(label))
+        ledger = Ledger(spool.folder)
+        receivers = sorted({name for scan in scans for name in ledger.receivers(scan)})
+        removed = [folder for scan in scans for folder in purge_scan(spool, scan)]
     for folder in removed:
         click.echo(f"removed {folder}")
+    if receivers:
+        click.echo(f"copies handed over to {', '.join(receivers)} stay there")
     if old and not removed:
         click.echo("nothing is past its retention period")
     # Labels leave the index together with the scans, not at the next query.
     ScanIndex(spool).find(limit=0)
 
 
-def _purge_label(spool: Spool, label: str) -> list[Path]:
+def _labelled(spool: Spool, label: str) -> list[str]:
     found = ScanIndex(spool).ids_of(label)
     if not found:
         raise SpoolError(
             f"there is no scan with the label {label!r}; see station list; "
             "a scan that is being taken is ended with station cancel"
         )
-    return [folder for scan_id in found for folder in purge_scan(spool, scan_id)]
+    return found
 
 
 @click.command()

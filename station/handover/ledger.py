@@ -75,6 +75,16 @@ class Ledger:
         waiting = self._place(entry.target, "waiting")
         (waiting / f"{entry.scan_id}.json").unlink(missing_ok=True)
 
+    def receivers(self, scan_id: str) -> list[str]:
+        """Targets that have a copy of a scan's result; also those that booth.toml named before."""
+        return sorted(done.parent.parent.name for done in self._folder.glob(f"*/done/{scan_id}"))
+
+    def forget(self, scan_id: str) -> None:
+        """Remove all that is kept of a scan that was deleted."""
+        for pattern in (f"*/done/{scan_id}", f"*/waiting/{scan_id}.json"):
+            for path in self._folder.glob(pattern):
+                path.unlink(missing_ok=True)
+
     def waiting(self) -> list[Waiting]:
         """All waiting results of all targets."""
         if not self._folder.is_dir():

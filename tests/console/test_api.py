@@ -146,7 +146,11 @@ def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) ->
     with console.client() as client:
         found = client.get("/scans", params={"text": "BE DEL"}).json()["scans"]
         assert [scan["scan_id"] for scan in found] == [done["scan_id"]]
+        ledger = Ledger(console.config.spool.folder)
+        ledger.finish(Waiting("shop", done["scan_id"]))
+        assert client.get(f"/scans/{done['scan_id']}").json()["handed_over"] == ["shop"]
         assert client.delete(f"/scans/{done['scan_id']}").json() == {"scans": [done["scan_id"]]}
+        assert ledger.receivers(done["scan_id"]) == []
         _problem(client.get(f"/scans/{done['scan_id']}"), 404, "no-such-scan")
         _problem(client.delete("/scans", params={"label": "nobody"}), 404, "no-such-scan")
     log = (console.config.console.folder / "audit.log").read_text()

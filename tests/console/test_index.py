@@ -24,6 +24,7 @@ from station.core.config_file import load_config
 from station.core.files import write_json
 from station.core.scans import CANCELLED, REASON, ScanId, ScanNote
 from station.core.spool import Spool
+from station.handover.ledger import Ledger, Waiting
 
 
 @pytest.fixture
@@ -258,7 +259,11 @@ def test_the_api_tells_of_a_scan_that_was_never_stored_without_a_station(spool: 
     config = load_config(spool.folder.parent / "booth.toml")
     waiting = SimpleNamespace(status=lambda _: None)
     told: Any = SimpleNamespace(
-        spool=spool, index=ScanIndex(spool), countdown=waiting, config=config
+        spool=spool,
+        index=ScanIndex(spool),
+        ledger=Ledger(spool.folder),
+        countdown=waiting,
+        config=config,
     )
     scan_id = ScanId("20261125T100000Z-7f3a")
     with pytest.raises(ProblemError, match="there is no scan"):
@@ -273,7 +278,9 @@ def test_a_scan_that_was_taken_after_all_is_not_said_to_have_failed(spool: Spool
     refused = {"state": "failed", "label": "Order 7", "reason": "control did not answer within 5 s",
                "framesets": 0, "wanted": 0}  # fmt: skip
     waiting = SimpleNamespace(status=lambda scan_id: {**refused, "scan_id": scan_id})
-    told: Any = SimpleNamespace(index=ScanIndex(spool), countdown=waiting)
+    told: Any = SimpleNamespace(
+        index=ScanIndex(spool), ledger=Ledger(spool.folder), countdown=waiting
+    )
     assert _state(told, "20261120T100000Z-0000").state == "accepted"
     assert _state(told, "20261125T100000Z-7f3a").state == "failed"
 
@@ -340,6 +347,18 @@ def test_purge_by_label(spool: Spool) -> None:
     assert len(ScanIndex(spool).find()) == 3
     assert CliRunner().invoke(purge, ["--label", "Order", *option]).exit_code == 1
     assert CliRunner().invoke(purge, ["x", "--old", *option]).exit_code == 2
+
+
+def test_copies_that_were_handed_over_are_told_by_purge(spool: Spool) -> None:
+    option, ledger = _booth(spool), Ledger(spool.folder)
+    scan_id = "20261121T100000Z-0001"
+    ledger.finish(Waiting("orders", scan_id))
+    ledger.keep(Waiting("share", scan_id))
+    done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
+    assert done.output.endswith("copies handed over to orders stay there\n")
+    assert (ledger.receivers(scan_id), ledger.waiting()) == ([], [])
+    [other, *_] = [scan.scan_id for scan in ScanIndex(spool).find()]
+    assert "copies handed" not in CliRunner().invoke(purge, [other, *option]).output
 
 
 def test_what_is_removed_of_a_scan_that_was_never_stored_is_told(spool: Spool) -> None:

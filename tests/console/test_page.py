@@ -5,9 +5,13 @@ page_in_browser.py has every other view and what goes wrong; `make test-console`
 
 from __future__ import annotations
 
+from typing import Any
+
 from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
 from live_console import LiveConsole
 from playwright.sync_api import expect
+
+from station.handover.ledger import Ledger, Waiting
 
 _NOTE_WORDS = """() => {
   window.told = [];
@@ -85,3 +89,27 @@ def test_a_booth_that_takes_no_scans_says_so(console: LiveConsole) -> None:
         expect(troubles).not_to_contain_text("扫描室尚未校准", timeout=LONG_MS)
         open_view(page, console, "scan")
         expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
+
+
+def test_copies_that_stay_are_told_before_a_scan_is_deleted(
+    console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    """The page said that it was deleted, and programs that it was handed over to had it still."""
+    scan_id = scans[0]["scan_id"]
+    ledger = Ledger(console.config.spool.folder)
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "history")
+        erase = page.locator(f"[data-scan='{scan_id}'] .danger")
+        dialog = page.get_by_role("dialog")
+        try:
+            for receivers in ([], ["orders", "share"]):
+                for name in receivers:
+                    ledger.finish(Waiting(name, scan_id))
+                erase.click()
+                copies = expect(dialog.get_by_text("Copies handed over to orders, share stay"))
+                copies.to_have_count(1 if receivers else 0, timeout=LONG_MS)
+                dialog.get_by_role("button", name="Cancel").click()
+        finally:
+            ledger.forget(scan_id)

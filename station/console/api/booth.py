@@ -40,7 +40,6 @@ from station.console.live.control import command
 from station.core.errors import BoothError, CalibrationError
 from station.core.geometry import invert, so3_log
 from station.core.rig import Rig
-from station.handover.ledger import Ledger
 from station.messaging.messages import Request as ControlRequest
 
 router = APIRouter()
@@ -137,7 +136,6 @@ def _session(console: Console, caller: Caller | None) -> Session:
 @router.get("/booth", responses=responses(), tags=["booth"])
 def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
     """Cameras with their remedies, framesets, spool, disk, calibration, hand-overs."""
-    ledger = Ledger(console.config.spool.folder)
     # Whom booth.toml no longer names is waited for by nobody.
     targets = {target.name for target in console.config.deliver}
     return BoothState(
@@ -145,7 +143,9 @@ def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
         calibration=_calibration_in_use(console),
         last_check=_last_check(console),
         waiting_deliveries=[
-            Delivery(**entry.document()) for entry in ledger.waiting() if entry.target in targets
+            Delivery(**entry.document())
+            for entry in console.ledger.waiting()
+            if entry.target in targets
         ],
     )
 

@@ -29,6 +29,7 @@ from station.core.config import BoothConfig
 from station.core.scans import SCAN_ID
 from station.core.service import Heartbeat
 from station.core.spool import Spool
+from station.handover.ledger import Ledger
 
 COOKIE = "booth_session"
 
@@ -49,6 +50,7 @@ class Console:
     pictures: Pictures = field(init=False)
     countdown: ScanCountdown = field(init=False)
     tasks: Tasks = field(init=False)
+    ledger: Ledger = field(init=False)
     throttle: LoginThrottle = field(init=False)
     checking: threading.BoundedSemaphore = field(init=False)
     """Held by each password that is being checked."""
@@ -60,6 +62,7 @@ class Console:
         self.vault, self.audit = Vault(folder), AuditLog(folder)
         self.spool = Spool(self.config.spool.folder)
         self.index, self.events = ScanIndex(self.spool), EventLog()
+        self.ledger = Ledger(self.config.spool.folder)
         self.watch = Watch(self.config, self.events, self.log)
         self.pictures = Pictures(self.config, self.log)
         self.countdown = ScanCountdown(self.config, self.events)

@@ -121,6 +121,7 @@ class Scan(BaseModel):
     seconds: dict[str, float] = Field(description="duration of each step of the reconstruction")
     framesets: int
     wanted: int
+    handed_over: list[str] = Field(description="targets of [[deliver]] that have a copy")
 
 
 class ScanPage(BaseModel):

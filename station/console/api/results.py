@@ -248,8 +248,8 @@ def comparison(
     second, other_folder = _open(console, caller, other, "comparison")
     surfaces = compare_surfaces(folder, other_folder)
     return Comparison(
-        first=of_record(record),
-        second=of_record(second),
+        first=of_record(console, record),
+        second=of_record(console, second),
         pose=pose,
         unit=unit,
         rows=compare_rows(folder, other_folder, pose, unit, language),  # type: ignore[arg-type]

@@ -66,7 +66,7 @@ def list_scans(
         limit=limit,
     )
     following = f"{found[-1].created} {found[-1].scan_id}" if len(found) == limit else ""
-    return ScanPage(scans=[of_record(record) for record in found], next=following)
+    return ScanPage(scans=[of_record(console, record) for record in found], next=following)
 
 
 @router.post("", status_code=202, responses=responses(404, 409))
@@ -112,7 +112,7 @@ def _state(console: Console, scan_id: str) -> Scan:
     # First what is on disk: a station whose answer came too late for the countdown took the scan.
     record = console.index.get(scan_id)
     if record is not None:
-        return of_record(record)
+        return of_record(console, record)
     waiting = console.countdown.status(scan_id)
     if waiting is not None:
         return _of_session(waiting)
@@ -124,11 +124,11 @@ def _state(console: Console, scan_id: str) -> Scan:
         noted = read_noted(console.spool, scan_id_of(scan_id))
         if noted is None:
             raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
-        return of_record(noted)
+        return of_record(console, noted)
     if found.state not in _ON_DISK:
         return found
     # On disk by now, or deleted: the folders take precedence over the station's memory.
-    return of_record(console.record(scan_id))
+    return of_record(console, console.record(scan_id))
 
 
 @router.post("/{scan_id}/cancel", responses=responses(404, 409))
@@ -167,7 +167,7 @@ def delete_label(
     return Removed(scans=found)
 
 
-def of_record(record: ScanRecord) -> Scan:
+def of_record(console: Console, record: ScanRecord) -> Scan:
     """A scan on disk."""
     return Scan(
         scan_id=record.scan_id,
@@ -182,6 +182,7 @@ def of_record(record: ScanRecord) -> Scan:
         seconds=dict(record.seconds),
         framesets=0,
         wanted=0,
+        handed_over=console.ledger.receivers(record.scan_id),
     )
 
 
@@ -201,4 +202,5 @@ def _of_session(session: dict[str, Any]) -> Scan:
         seconds={},
         framesets=session["framesets"],
         wanted=session["wanted"],
+        handed_over=[],
     )

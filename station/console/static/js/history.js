@@ -46,9 +46,11 @@ export async function history(main, session) {
   }
 
   async function erase(scan, name) {
-    const sure = await ask(t('history.sure'), t('history.sureText', { name: `${name}, ${time(scan.created)}` }), t('history.delete'), t('cancel'), true);
-    if (!sure) return;
     try {
+      const { handed_over: receivers } = await get(`/scans/${scan.scan_id}`);
+      const text = t('history.sureText', { name: `${name}, ${time(scan.created)}` });
+      const copies = receivers.length ? ` ${t('history.copies', { names: receivers.join(', ') })}` : '';
+      if (!await ask(t('history.sure'), text + copies, t('history.delete'), t('cancel'), true)) return;
       await remove(`/scans/${scan.scan_id}`);
       notice(t('history.deleted'));
       forget(scan.scan_id);
