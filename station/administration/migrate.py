@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from station.administration.booth_file import STATE_FOLDER
 from station.core.errors import FormatError
 from station.core.files import private_folder, read_json, write_json
 
@@ -15,6 +16,9 @@ FORMAT = "booth-state"
 VERSION = 1
 """Increased with every change of the layout; deploy/package/body-booth/preinst names the versions
 that it reads."""
+
+_HOLDS = frozenset({STATE, "calibration.json", "calibrations", "console", "spool"})
+"""What a station's state folder holds one of, unless it is new."""
 
 Migrations = Mapping[int, Callable[[Path], None]]
 MIGRATIONS: Migrations = {}
@@ -47,12 +51,27 @@ def migrate(folder: Path, migrations: Migrations = MIGRATIONS, version: int = VE
     return found
 
 
+def check_is_state(folder: Path) -> None:
+    """Refuse a folder of somebody else, in which a state would be begun.
+
+    Raises:
+        FormatError: it holds something, and nothing of a station. The installed booth's own folder
+            may be a disk with what disks hold.
+    """
+    held = {entry.name for entry in folder.iterdir()}
+    if folder != STATE_FOLDER and held and not held & _HOLDS:
+        raise FormatError(
+            f"{folder} is no station's state folder: it holds none of {', '.join(sorted(_HOLDS))}; "
+            "name the right one with --state"
+        )
+
+
 @click.command()
 @click.option(
     "--state",
     "folder",
-    type=click.Path(path_type=Path),
-    default="/var/lib/booth",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=STATE_FOLDER,
     show_default=True,
     help="the state folder",
 )
@@ -63,6 +82,7 @@ def migrate_command(folder: Path) -> None:
     Examples:
       station migrate
     """
+    check_is_state(folder)
     found = migrate(folder)
     if found != VERSION:
         click.echo(f"{folder}: layout version {found} is now version {VERSION}")

@@ -10,13 +10,13 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from station.administration.archive import parts, save
 from station.administration.backup import backup
 from station.administration.booth_file import administration, booth_toml, name_cameras
 from station.administration.connected import connected_cameras, crowded_controllers
-from station.administration.migrate import MIGRATIONS, VERSION, migrate
+from station.administration.migrate import MIGRATIONS, VERSION, migrate, migrate_command
 from station.administration.restore import _protect, restore
 from station.administration.setup import compare_sensors, setup
 from station.core import bundle, rig
@@ -341,6 +341,23 @@ def test_every_file_of_a_booth_belongs_to_a_part(booth: Path) -> None:
 def test_a_new_state_folder_gets_this_version(tmp_path: Path) -> None:
     assert migrate(tmp_path / "state") == 1
     assert json.loads((tmp_path / "state/state.json").read_text())["version"] == 1
+
+
+def test_only_a_stations_state_is_migrated(tmp_path: Path) -> None:
+    """A folder that was mistyped became a new state."""
+
+    def migrated(folder: Path) -> Result:
+        return CliRunner().invoke(migrate_command, ["--state", str(folder)])
+
+    assert "does not exist" in migrated(tmp_path / "typo").output
+    (other := tmp_path / "other").mkdir()
+    (other / "letters").mkdir()
+    assert "is no station's state folder" in str(migrated(other).exception)
+    assert not (tmp_path / "typo").exists()
+    assert not (other / "state.json").exists()
+    (other / "spool").mkdir()
+    assert migrated(other).exit_code == 0
+    assert (other / "state.json").exists()
 
 
 def test_migrations_run_one_by_one_and_go_on_after_a_crash(tmp_path: Path) -> None:
