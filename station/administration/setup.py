@@ -31,7 +31,7 @@ from station.administration.connected import (
 )
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.console.security.vault import Vault
-from station.core.commands import config_option
+from station.core.commands import at_most_one, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.drivers import CameraConfig
@@ -80,6 +80,7 @@ def setup(
       station setup --camera front-upper=A00366902406041A --replace
       station setup --virtual
     """
+    at_most_one(virtual=virtual, recordings=recordings, camera=pairs)
     path = find_config(config_path).resolve()
     if path == CONFIG and not is_installed_root():
         raise ConfigError(f"{path} belongs to root: run it with sudo, or give another --config")

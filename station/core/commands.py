@@ -36,6 +36,20 @@ _NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
 _NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
 
+def at_most_one(**given: object) -> None:
+    """Refuse options of which the command would ignore all but one.
+
+    Args:
+        given: option -> its value.
+
+    Raises:
+        UsageError: several are given.
+    """
+    names = [f"--{name}" for name, value in given.items() if value]
+    if len(names) > 1:
+        raise click.UsageError(f"{' or '.join(names)}, not {'both' if len(names) == 2 else 'all'}")
+
+
 class Number(click.FloatRange):
     """A number in a range. NaN lies in every range of click's own."""
 

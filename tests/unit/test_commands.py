@@ -36,6 +36,25 @@ def test_every_command_explains_itself(group: click.Group, name: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate --new --list",
+        "calibrate --new --use 20261121T100000Z",
+        "calibrate --list --recordings .",
+        "check --correct --recordings .",
+        "check --correct --json",
+        "setup --virtual --camera front-upper=A1",
+    ],
+)
+def test_options_that_exclude_each_other_are_refused(words: str) -> None:
+    """All but one of them were ignored."""
+    done = CliRunner().invoke(station_cli.station, words.split())
+    assert done.exit_code == 2
+    assert ", not both" in done.output
+    assert "starting" not in done.output
+
+
+@pytest.mark.parametrize(
     ("given", "words"),
     [
         ("nan", "nan is not a number above 0 up to 90 days."),

@@ -11,6 +11,7 @@ from typing import Any
 import click
 from pydantic import BaseModel, FiniteFloat, ValidationError
 
+from station.core.commands import at_most_one
 from station.core.errors import FormatError, InputError
 from station.core.files import read_json
 from station.core.words.terms import plain_name
@@ -53,8 +54,7 @@ def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> No
       reconstruct measure result --pose standard --csv > standard.csv
       reconstruct measure mesh.ply --json
     """
-    if as_json and as_csv:
-        raise click.UsageError("--json or --csv, not both")
+    at_most_one(json=as_json, csv=as_csv)
     document = _of_result(source, pose) if source.is_dir() else _of_mesh(source, pose, up)
     if as_json:
         click.echo(json.dumps(document))

@@ -18,7 +18,7 @@ from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
-from station.core.commands import config_option
+from station.core.commands import at_most_one, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
@@ -58,6 +58,8 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
       station check --json
       station check --correct
     """
+    at_most_one(correct=correct, recordings=recordings)
+    at_most_one(correct=correct, json=as_json)
     config = load_config(find_config(config_path))
     if correct:
         _correct(config)

@@ -11,7 +11,7 @@ import click
 
 from station.calibration.detect.step_names import HANGING, RAISED_M, STAND
 from station.calibration.guide.operator import Guide
-from station.core.commands import Number, config_option
+from station.core.commands import Number, at_most_one, config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import CalibrationError
 from station.core.files import local_time
@@ -47,6 +47,9 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
                 step = context.invoked_subcommand
                 raise click.UsageError(f"put options after the step: station calibrate {step} ...")
             return None
+        use, listing = kwargs.get("use_name"), kwargs.get("list_them")
+        at_most_one(use=use, list=listing, new=kwargs.get("new"))
+        at_most_one(use=use, list=listing, recordings=recordings)
         return _called(command, args, kwargs, config_path, recordings, yes)
 
     return wrapped
