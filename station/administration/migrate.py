@@ -18,7 +18,7 @@ VERSION = 1
 that it reads."""
 
 _HOLDS = frozenset({STATE, "calibration.json", "calibrations", "console", "spool"})
-"""What a station's state folder holds one of, unless it is new."""
+"""Names of which a station's state folder holds one, unless it is new."""
 
 Migrations = Mapping[int, Callable[[Path], None]]
 MIGRATIONS: Migrations = {}

@@ -16,6 +16,7 @@ from station.core.config_file import find_config, load_config
 from station.core.files import local_time
 from station.core.scans import ScanId, is_scan_id
 from station.core.spool import Spool
+from station.core.words.terms import verdict_words
 
 _limit_option = click.option(
     "--limit",
@@ -29,8 +30,8 @@ _LABEL_LETTERS = 40
 _WORDS = {
     "accepted": "waiting",
     "reconstructing": "reconstructing",
-    "delivered": "ok",
-    "rescan": "scan again",
+    "delivered": verdict_words("ok"),
+    "rescan": verdict_words("rescan"),
     "failed": "failed",
 }
 

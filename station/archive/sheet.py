@@ -33,7 +33,7 @@ from station.archive.tables import (
     rows,
     side_differences,
 )
-from station.core.words.terms import Language
+from station.core.words.terms import Language, verdict_words
 
 _WIDTH, _HEIGHT = A4
 _MARGIN = 34.0
@@ -43,10 +43,7 @@ _DIFFERENCE = 60.0
 """From a column's right edge to where the differences of left and right end."""
 _INK, _GREY, _RULE = HexColor("#16202c"), HexColor("#5c6a7a"), HexColor("#cdd5de")
 _LINE = HexColor("#c2410c")
-_VERDICTS = {
-    "ok": ("OK", "合格", HexColor("#15803d")),
-    "rescan": ("SCAN AGAIN", "请重新扫描", HexColor("#b45309")),
-}
+_COLOURS = {"ok": HexColor("#15803d"), "rescan": HexColor("#b45309")}
 _WORDS: dict[Language, dict[str, str]] = {
     "en": {"front": "front", "left": "left side", "back": "back", "as-scanned": "as scanned",
            "standard": "standard pose", "value": "value", "l": "left", "r": "right",
@@ -132,9 +129,9 @@ def _half(row: dict[str, Any]) -> float:
 
 def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: Language) -> None:
     words = _WORDS[language]
-    english, chinese, colour = _VERDICTS.get(scan.verdict, (scan.verdict, scan.verdict, _GREY))
-    verdict = chinese if language == "zh" else english
+    verdict = verdict_words(scan.verdict, language).upper()
     width = _width(verdict, 22, bold=True) + 24
+    colour = _COLOURS.get(scan.verdict, _GREY)
     canvas.setFillColor(colour)
     canvas.roundRect(_WIDTH - _MARGIN - width, _HEIGHT - 66, width, 34, 5, stroke=0, fill=1)
     _text(

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from station.archive.records import ScanRecord
 from station.core.errors import FormatError
 from station.core.files import MAX_JSON_BYTES, read_bounded_json
-from station.core.words.terms import Language, plain_name, split_side
+from station.core.words.terms import Language, plain_name, split_side, verdict_words
 
 Unit = Literal["cm", "in", "m"]
 Pose = Literal["as-scanned", "standard"]
@@ -28,10 +28,9 @@ _HEADS = {
            "单位", "依据", "标准"),
 }  # fmt: skip
 _WORDS = {
-    "en": {"ok": "ok", "rescan": "scan again", "as-scanned": "as scanned", "standard": "standard",
-           "left": "left", "right": "right"},
-    "zh": {"ok": "合格", "rescan": "请重新扫描", "as-scanned": "扫描姿势", "standard": "标准姿势",
-           "left": "左", "right": "右"},
+    "en": {"as-scanned": "as scanned", "standard": "standard", "left": "left", "right": "right"},
+    "zh": {"as-scanned": "扫描姿势", "standard": "标准姿势", "left": "左", "right": "右",
+           "seen": "可见", "partly": "部分可见", "inferred": "推算"},
 }  # fmt: skip
 _MARKS: dict[str, tuple[str, dict[Language, str]]] = {
     "partly": ("*", {"en": "the cameras saw only a part of this line",
@@ -162,12 +161,12 @@ def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: 
     writer = csv.writer(stream, lineterminator="\r\n")
     writer.writerow(_HEADS[language])
     words = _WORDS[language]
-    verdict, pose = words.get(scan.verdict, scan.verdict), words[document["pose"]]
+    verdict, pose = verdict_words(scan.verdict, language), words[document["pose"]]
     for row in rows(document, unit, language):
-        side = words.get(row["side"], "")
+        side, basis = words.get(row["side"], ""), words.get(row["basis"], row["basis"])
         texts = (scan.label or scan.scan_id, scan.created, verdict, pose, row["words"], side)
         numbers = ("" if row[key] is None else row[key] for key in ("value", "low", "high"))
-        writer.writerow([*map(_harmless, texts), *numbers, unit, row["basis"], row["standard"]])
+        writer.writerow([*map(_harmless, texts), *numbers, unit, basis, row["standard"]])
     return "\ufeff" + stream.getvalue()
 
 

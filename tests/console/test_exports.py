@@ -31,7 +31,7 @@ from station.core.config_file import load_config
 from station.core.geometry import so3_exp
 from station.core.service import set_up_logs
 from station.core.spool import Spool
-from station.core.words.terms import TERMS, plain_name, split_side
+from station.core.words.terms import TERMS, Language, plain_name, split_side
 from station.handover.deliver_cli import HandOver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from workers.measure.definitions import DEFINITIONS
@@ -68,9 +68,20 @@ def test_a_label_is_never_a_formula() -> None:
     assert table.startswith("\ufeff")
     read = list(csv.DictReader(io.StringIO(table.lstrip("\ufeff"))))
     assert read[0]["order"] == '\'=HYPERLINK("http://evil")'
-    assert (read[0]["value"], read[0]["unit"], read[0]["verdict"]) == ("84.2", "cm", "ok")
+    assert (read[0]["value"], read[0]["unit"], read[0]["verdict"]) == ("84.2", "cm", "usable")
     assert read[1]["value"] == ""
     assert rows(_DOCUMENT, "in", "en")[0]["value"] == 33.15
+
+
+def test_a_spreadsheet_is_in_one_language() -> None:
+    """The basis was English in the Chinese one."""
+
+    def bases(language: Language) -> list[str]:
+        table = csv_table(_scan("Order 1"), _DOCUMENT, "cm", language).lstrip("\ufeff")
+        return [line[10] for line in list(csv.reader(io.StringIO(table)))[1:]]
+
+    assert bases("en") == ["seen", "", "partly"]
+    assert bases("zh") == ["可见", "", "部分可见"]
 
 
 def test_seamly_reads_what_was_written() -> None:
@@ -104,7 +115,7 @@ def test_the_sheet_has_the_whole_table_on_one_page(
     assert [round(float(side)) for side in page.mediabox[2:]] == [595, 842]
     text = page.extract_text()
     assert "Order 1234" in text
-    assert ("OK" in text) or ("SCAN AGAIN" in text)
+    assert ("USABLE" in text) or ("SCAN AGAIN" in text)
     for row in rows(read_measurements(folder, "standard"), "cm", "en"):
         assert row["words"] in text
         assert row["value"] is None or f"{row['value']:.1f}" in text

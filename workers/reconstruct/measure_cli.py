@@ -14,7 +14,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from station.core.commands import at_most_one
 from station.core.errors import FormatError, InputError
 from station.core.files import read_json
-from station.core.words.terms import plain_name
+from station.core.words.terms import plain_name, verdict_words
 
 _DIGITS = 5
 """Decimals in tables: hundredths of a millimetre, far below any interval."""
@@ -194,7 +194,8 @@ def _print_table(document: dict[str, Any]) -> None:
 
     words = {definition.name: definition.words for definition in DEFINITIONS}
     for name, text in _heading(document):
-        click.echo(f"{name.replace('_', ' ')}: {_plain(text)}")
+        told = verdict_words(text) if name == "verdict" else text
+        click.echo(f"{name.replace('_', ' ')}: {_plain(told)}")
     exact = not any(
         row["value_m"] is not None and row["interval95_m"][0] < row["interval95_m"][1]
         for row in document["measurements"]

@@ -21,6 +21,7 @@ from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
 from station.core.service import STATION_LOCK
+from station.core.words.terms import verdict_words
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError
 
@@ -86,9 +87,9 @@ def scan(
     again = session["state"] == "rescan"
     if again:
         # Before any number, which nobody should then take down.
-        click.echo(f"scan again: {session['reason']}", err=True)
+        click.echo(f"{verdict_words('rescan')}: {session['reason']}", err=True)
     else:
-        click.echo("verdict: usable")
+        click.echo(f"verdict: {verdict_words('ok')}")
     took = f"{time.monotonic() - began_s:.1f} s from the command to the result"
     path = session["path"]
     if not path or not Path(path).is_dir():

@@ -101,6 +101,18 @@ TERMS = {
 """SeamlyMe's names have no sides; a measurement of its own is one that means the same line."""
 
 
+VERDICTS: dict[str, tuple[str, str]] = {
+    "ok": ("usable", "合格"),
+    "rescan": ("scan again", "请重新扫描"),
+}
+
+
+def verdict_words(verdict: str, language: Language = "en") -> str:
+    """A result's verdict as an operator reads it; what is none stays as it is."""
+    english, chinese = VERDICTS.get(verdict, (verdict, verdict))
+    return chinese if language == "zh" else english
+
+
 def split_side(name: str) -> tuple[str, Side]:
     """A row's name without its side, and the side: wrist_girth_left -> (wrist_girth, left)."""
     stem, _, last = name.rpartition("_")
