@@ -127,8 +127,9 @@ class HandOver:
             self._postpone(entry, f"{type(error).__name__}: {error}", now_s)
             return
         self._ledger.finish(entry)
-        words = "%s handed over to %s"
-        self._log.info(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
+        self._log.info(
+            "%s handed over to %s", entry.scan_id, entry.target, extra={"scan": entry.scan_id}
+        )
 
     def _postpone(self, entry: Waiting, reason: str, now_s: float) -> None:
         after = entry.failed(reason, now_s)

@@ -73,7 +73,8 @@ class FolderTarget:
             beside.rename(final)
             fsync_folder(self._folder)
         except OSError as cause:
-            raise HandOverError(f"{self._folder}: {cause.strerror or cause}") from None
+            reason = cause.strerror or cause
+            raise HandOverError(f"{self._folder} cannot be written ({reason})") from None
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -116,8 +117,9 @@ class WebhookTarget:
             raise HandOverError(f"{self._url} answers {cause.code}") from None
         except (OSError, ValueError, http.client.HTTPException) as cause:
             # What is no HTTP is neither an OSError nor a ValueError.
-            reason = str(getattr(cause, "reason", cause)).strip()
-            raise HandOverError(f"{self._url}: {reason}") from None
+            reason = getattr(cause, "reason", cause)
+            words = getattr(reason, "strerror", None) or str(reason).strip()
+            raise HandOverError(f"{self._url} cannot be reached ({words})") from None
 
     def signature(self, body: bytes, seconds: int) -> str:
         """The header's value.
@@ -128,7 +130,7 @@ class WebhookTarget:
         try:
             secret = self._secret_file.read_bytes().strip()
         except OSError as cause:
-            raise HandOverError(f"{self._secret_file}: {cause.strerror}") from None
+            raise HandOverError(f"{self._secret_file} cannot be read ({cause.strerror})") from None
         mac = hmac.new(secret, f"{seconds}.".encode() + body, hashlib.sha256).hexdigest()
         return f"t={seconds},v1={mac}"
 

@@ -50,12 +50,13 @@ SPEAKERS = (
     "station/console/live/tasks.py", "station/console/live/guided.py",
     "station/console/api/booth.py", "station/console/api/scans.py",
     "station/console/security/gate.py", "station/handover/targets.py",
+    "station/handover/deliver_cli.py",
 )  # fmt: skip
 """Modules whose sentences an operator reads on the page."""
 NOT_SHOWN = re.compile(
     r"(sync|control) does not know the command|a (sync|control) process is already running|"
     r"default-src|a WebSocket|belongs to another user|the driver freenect needs|up or down|"
-    r"turning left|^scan %s|forward or back|waits for the disk|^yes or no$|^folder ="
+    r"there is nobody to hand|turning left|^scan %s|forward or back|waits for the disk|^yes or no$|^folder ="
 )
 """Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
 ENGLISH = re.compile(r"(?<![\w.-])(?:[a-z]{2,}[ ,]+){2}[a-z]{2,}")
@@ -157,6 +158,11 @@ SPOKEN = [
     "nothing of the person's back was seen; nothing of the left hand was seen",
     "the cloud shows only 12 % of the left forearm; the cloud shows only 12 % of the person's back",
     "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
+    "deliver orders: 3 not handed over (https://x cannot be reached (Connection refused)); it will "
+    "be retried",
+    "deliver orders: the target has not responded for 75 s; check the network and the other machine",
+    "deliver share: 1 not handed over (/mnt/x does not exist; is the share mounted?); it will be "
+    "retried",
 ]
 
 
