@@ -24,7 +24,7 @@ import sys
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -240,6 +240,10 @@ class ControlProcess:
         if status["state"] == "failed":
             return Reply(ok=True, content=status)
         if status["state"] in ("armed", "capturing"):
+            note = self._spool.notes.read(scan_id)
+            if note is not None and note.stage == "armed" and note.boot == boot_id():
+                # It may overtake its order, which waits for a sync that restarts.
+                request = replace(request, valid_until_s=note.valid_until_s)
             answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
             if not answer.ok:
                 return answer

@@ -228,7 +228,7 @@ class SyncProcess:
             self._take_up(order)
             return Reply(ok=True)
         if request.command == "cancel":
-            return self._cancel(scan_id_of(request.scan_id))
+            return self._cancel(scan_id_of(request.scan_id), request.valid_until_s)
         return Reply(ok=False, error=f"sync does not know the command {request.command!a:.80}")
 
     def _take_up(self, order: Order) -> None:
@@ -237,7 +237,7 @@ class SyncProcess:
             return
         if order.late(time.monotonic()):
             self._writer.refuse(order, LATE)
-        elif reason := self._unready():
+        elif reason := CANCELLED if order.scan_id in self._cancelled else self._unready():
             self._writer.refuse(order, reason)
         else:
             self._order = order
@@ -269,20 +269,23 @@ class SyncProcess:
             return f"{told}; scan again in a few seconds; {stays}; {remedy}"
         return "; ".join(self._troubles())
 
-    def _cancel(self, scan_id: ScanId) -> Reply:
-        """Stop collecting a scan and discard what was collected."""
-        if self._order is not None and self._order.scan_id == scan_id:
-            self._cancelled.add(scan_id)
-            return Reply(ok=True)
+    def _cancel(self, scan_id: ScanId, valid_until_s: float = 0.0) -> Reply:
+        """Stop collecting a scan and discard what was collected; its order may come later, until
+        `valid_until_s`, if it was sent while sync was restarting."""
         if scan_id in self._writing:
             return Reply(
                 ok=False, error=f"scan {scan_id} is being stored: it is too late to cancel"
             )
-        collection = self._collection
-        if collection is None or collection.order.scan_id != scan_id:
+        collection, ended = self._collection, {event.scan_id for event in self._ended}
+        if collection is not None and collection.order.scan_id == scan_id:
+            self._collection = None
+            self._fail(collection.order, CANCELLED)
+        elif scan_id in self._in_hand() or (
+            scan_id not in ended and time.monotonic() < valid_until_s
+        ):
+            self._cancelled.add(scan_id)
+        else:
             return Reply(ok=False, error=f"scan {scan_id} is not being taken")
-        self._collection = None
-        self._fail(collection.order, CANCELLED)
         return Reply(ok=True)
 
     def _tell(self, collection: Collection, state: str) -> None:

@@ -30,10 +30,10 @@ from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
 from station.core.rig import Rig
-from station.core.scans import CANCELLED, scan_id_of
+from station.core.scans import CANCELLED, ScanNote, boot_id, scan_id_of
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.core.spool import Spool
-from station.messaging.messages import Reply
+from station.messaging.messages import Reply, Request
 from station.sensors.freenect import FreenectCamera
 from station.sensors.identity import calibrated_serials
 from station.simulation.scene import default_rig
@@ -432,6 +432,33 @@ def test_a_scan_that_is_being_stored_is_told_as_such_when_it_is_cancelled(
             False,
             "scan one is being stored: it is too late to cancel",
         )
+    finally:
+        sync._writer.close()
+        sync._context.destroy(linger=0)
+
+
+def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig) -> None:
+    """While sync restarted, the operator was told that the scan was not being taken; then it was
+    taken."""
+    later_s = time.monotonic() + 60.0
+    notes = Spool(config.spool.folder).notes
+    sync = SyncProcess(config, logging.getLogger("sync"))
+    try:
+        scan_id = scan_id_of("one")
+        notes.write(
+            ScanNote(scan_id, "armed", valid_until_s=later_s, boot=boot_id()), durable=False
+        )
+        assert not sync._reply(Request("cancel", scan_id)).ok
+        assert sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
+        assert sync._reply(Request("scan", scan_id, valid_until_s=later_s)).ok
+        while (note := notes.read(scan_id)) is None or note.stage == "armed":
+            time.sleep(0.05)
+        assert (note.stage, note.reason) == ("failed", CANCELLED)
+        for event in sync._writer.events():
+            sync._handle(event)
+        # It has ended: no order of it comes.
+        assert not sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
+        assert sync._cancelled == set()
     finally:
         sync._writer.close()
         sync._context.destroy(linger=0)
