@@ -27,6 +27,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from station.console.api.console import Console
+from station.console.app import create_app
 from station.console.security.certificate import make_certificate
 from station.console.security.origin import host_allowed, own_names, same_origin
 from station.console.security.throttle import FREE_TRIES, LoginThrottle, pause_s
@@ -36,6 +37,9 @@ from station.core.config import ConsoleConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError, ConfigError
 from station.core.service import read_health
+
+_SESSIONS_OF_A_PAGE = 60
+"""So many rows do not fit on one page of sqlite's, 4 kB."""
 
 
 @pytest.fixture
@@ -100,6 +104,32 @@ def test_a_console_that_is_watched_ends_quietly(tmp_path: Path, number: signal.S
             rest = console.stderr.read()
             assert console.wait(60.0) == 0
     assert rest == ""
+
+
+def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
+    """It was a 500 without words, from sqlite."""
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    console = Console(load_config(path), path, logging.getLogger())
+    console.vault.set_password(PASSWORD)
+    database = console.vault._database
+    [[pages]] = database.execute("PRAGMA page_count")
+    database.execute(f"PRAGMA max_page_count = {pages}")
+
+    async def answers() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(create_app(console))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            return [
+                await client.post(f"{API}/session", json={"password": PASSWORD})
+                for _ in range(_SESSIONS_OF_A_PAGE)
+            ]
+
+    *_, last = asyncio.run(answers())
+    assert (last.status_code, last.json()["type"]) == (503, "/problems/disk"), last.text
+    assert "No space left on device" in last.json()["detail"]
+    assert "console.sqlite" in last.json()["detail"]
+    console.vault.close()
+    console.audit.close()
 
 
 def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:

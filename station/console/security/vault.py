@@ -7,7 +7,9 @@ person's, so it is hashed with argon2id (RFC 9106) in a file of its own.
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 import secrets
 import sqlite3
 import threading
@@ -29,6 +31,14 @@ SCOPES: tuple[Scope, ...] = ("read", "scan", "manage")
 """See scans and the booth; take scans and move the sensors; delete, calibrate."""
 PASSWORD = "password"
 SHORTEST_PASSWORD = 8
+_DATABASE = "console.sqlite"
+_DISK_ERRORS = {
+    sqlite3.SQLITE_FULL: errno.ENOSPC,
+    sqlite3.SQLITE_IOERR: errno.EIO,
+    sqlite3.SQLITE_CANTOPEN: errno.EIO,
+    sqlite3.SQLITE_READONLY: errno.EROFS,
+}
+"""Primary codes of sqlite for a disk that refuses, and the system's."""
 _TOKEN_PREFIX = "booth_"
 _KEYS_KEPT_S = 7 * 86_400.0
 _SCHEMA = """
@@ -60,7 +70,7 @@ class Vault:
         self._hasher = PasswordHasher()
         self._lock = threading.Lock()
         self._database = sqlite3.connect(
-            private_file(folder / "console.sqlite"),
+            private_file(folder / _DATABASE),
             timeout=10,
             isolation_level=None,
             check_same_thread=False,
@@ -72,8 +82,19 @@ class Vault:
         self._database.close()
 
     def _run(self, query: str, *values: object) -> list[tuple[object, ...]]:
-        with self._lock:
-            return self._database.execute(query, values).fetchall()
+        """Run one statement.
+
+        Raises:
+            OSError: the disk refuses; sqlite's own errors would not be told as such.
+        """
+        try:
+            with self._lock:
+                return self._database.execute(query, values).fetchall()
+        except sqlite3.OperationalError as error:
+            code = _DISK_ERRORS.get(error.sqlite_errorcode & 0xFF)
+            if code is None:
+                raise
+            raise OSError(code, os.strerror(code), str(self._folder / _DATABASE)) from None
 
     @property
     def has_password(self) -> bool:
