@@ -137,6 +137,8 @@ def _expire(spool: Spool, name: str) -> bool:
         return True
     if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
         spool.notes.remove(ScanId(scan_id))
+        # Its result may have been taken away.
+        Ledger(spool.folder).forget(scan_id)
     return False
 
 

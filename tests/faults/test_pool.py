@@ -16,6 +16,7 @@ from station.core.errors import SpoolError
 from station.core.files import held
 from station.core.scans import REASON, ScanId, ScanNote
 from station.core.spool import Spool
+from station.handover.ledger import Ledger, Waiting
 from workers.reconstruct.job_handle import WARM_UP_S
 
 _DAY_S = 86_400.0
@@ -70,13 +71,18 @@ def test_a_bad_bundle_fails_once_with_its_reason(
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
     for state in ("done", "outbox", "queue"):
         spool.path(state, "a").mkdir()
+    # A target that booth.toml no longer names.
+    ledger = Ledger(spool.folder)
+    ledger.finish(Waiting("gone", "a"))
     retention = RetentionConfig(raw_days=2, result_days=9)
     start = Moment(1.8e9, 100.0, "boot")
     assert expire_old(spool, retention, start) == []
     later = replace(start, since_boot_s=100.0 + 3 * _DAY_S)
     assert expire_old(spool, retention, later) == [spool.path("done", "a")]
     later = replace(start, since_boot_s=100.0 + 10 * _DAY_S)
+    assert ledger.receivers("a") == ["gone"]
     assert expire_old(spool, retention, later) == [spool.path("outbox", "a")]
+    assert ledger.receivers("a") == []
     assert spool.path("queue", "a").exists()
 
 

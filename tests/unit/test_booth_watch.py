@@ -12,10 +12,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import open3d
 import pytest
 import zmq
 
+from station.archive.compare import compare_surfaces
+from station.archive.surfaces import _FACE
 from station.booth.health import booth_health
+from station.booth.retention import purge_scan
 from station.console.live import watch as watch_module
 from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog
@@ -91,6 +96,30 @@ def test_a_cancelled_scan_does_not_count_as_failed(
         return booth["failed"], booth["cancelled"], booth["spool"]["failed"]
 
     _until(lambda: counts() == (1, 1, 2))
+
+
+def _small_body(result: Path) -> Path:
+    """A result with a mesh of a small sphere."""
+    result.mkdir()
+    mesh = open3d.geometry.TriangleMesh.create_sphere(0.2, 6)
+    vertices = np.asarray(mesh.vertices, "<f4")
+    faces = np.zeros(len(mesh.triangles), _FACE)
+    faces["count"], faces["corners"] = 3, np.asarray(mesh.triangles)
+    head = f"ply\nelement vertex {len(vertices)}\nelement face {len(faces)}\nend_header\n"
+    (result / "mesh.ply").write_bytes(head.encode() + vertices.tobytes() + faces.tobytes())
+    return result
+
+
+def test_no_distances_of_a_deleted_body_are_kept(watch: tuple[Watch, EventLog]) -> None:
+    watching, _ = watch
+    spool = Spool(watching._config.spool.folder)
+    first, second = (_small_body(spool.path("outbox", name)) for name in ("a", "b"))
+    time.sleep(1.5)  # the watch looks again at folders that have just changed
+    assert compare_surfaces(first, second).rms_m < 1e-6
+    time.sleep(0.5)
+    assert compare_surfaces.cache_info().currsize == 1
+    purge_scan(spool, "a")
+    _until(lambda: compare_surfaces.cache_info().currsize == 0)
 
 
 def test_what_status_says_is_said_by_the_console(

@@ -12,6 +12,7 @@ from typing import Any
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from station.archive.compare import compare_surfaces
 from station.archive.index import ScanIndex
 from station.archive.records import PLACES, ScanRecord
 from station.booth.health import can_scan
@@ -201,6 +202,8 @@ class Watch:
         if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
+        # No distances of a body are kept that may have been deleted.
+        compare_surfaces.cache_clear()
         found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}
         states = {scan_id: scan.state for scan_id, scan in found.items()}
         before, self._seen = self._seen, dict(states)
