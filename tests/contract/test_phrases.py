@@ -56,7 +56,8 @@ SPEAKERS = (
 NOT_SHOWN = re.compile(
     r"(sync|control) does not know the command|a (sync|control) process is already running|"
     r"default-src|a WebSocket|belongs to another user|the driver freenect needs|up or down|"
-    r"there is nobody to hand|turning left|^scan %s|forward or back|waits for the disk|^yes or no$|^folder ="
+    r"there is nobody to hand|turning left|^scan %s|"
+    r"forward or back|waits for the disk|^yes or no$|^folder ="
 )
 """Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
 ENGLISH = re.compile(r"(?<![\w.-])(?:[a-z]{2,}[ ,]+){2}[a-z]{2,}")
@@ -160,7 +161,8 @@ SPOKEN = [
     "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
     "deliver orders: 3 not handed over (https://x cannot be reached (Connection refused)); it will "
     "be retried",
-    "deliver orders: the target has not responded for 75 s; check the network and the other machine",
+    "deliver orders: the target has not responded for 75 s; check the network and the other "
+    "machine",
     "deliver share: 1 not handed over (/mnt/x does not exist; is the share mounted?); it will be "
     "retried",
 ]
@@ -237,10 +239,15 @@ def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
     """It knew of a fault of the station and of its disk, and of nothing else."""
     well = {"running": True, "fault": "", "problems": [], "disk_free_mb": 9, "disk_needed_mb": 1}
     problems = [SPOKEN[6], "the booth is not calibrated, and takes no scans: run station calibrate"]
+    late = SPOKEN[-3:]
     states = [well, {**well, "problems": problems}, {**well, "running": False}]
+    states += [{**well, "problems": [*late, *problems]}, {**well, "problems": late[:1]}]
     said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
     assert said[:2] == [[], [in_language(text, "zh") for text in problems]]
     assert said[2] == ["扫描站没有响应："]
+    # Three failing hand-overs filled the view that a scan is taken in.
+    first = in_language(late[0], "zh")
+    assert said[3:] == [[*said[1], f"{first} (另有 2 项)"], [first]]
 
 
 def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:

@@ -3,10 +3,19 @@
 import { h } from './dom.js';
 import { said, t } from './i18n.js';
 
-// One sentence for each trouble, in the reader's language.
+const HAND_OVER = /^deliver /;
+
+// One sentence for each trouble, in the reader's language; one for all hand-overs, which are not in
+// the way of scans.
 export function troubles(state) {
   if (!state.running) return [t('booth.notRunning', { fault: said(state.fault) })];
-  if (state.problems.length) return state.problems.map(said);
+  if (state.problems.length) {
+    const [late, ...others] = state.problems.filter((problem) => HAND_OVER.test(problem));
+    const told = state.problems.filter((problem) => !HAND_OVER.test(problem)).map(said);
+    if (!late) return told;
+    const more = others.length ? ` (${t('booth.moreWaiting', { n: others.length })})` : '';
+    return [...told, said(late) + more];
+  }
   return state.disk_free_mb < 1.5 * state.disk_needed_mb ? [t('booth.diskLow')] : [];
 }
 
