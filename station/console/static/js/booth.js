@@ -16,7 +16,11 @@ function calibrated(name) {
 }
 
 export async function booth(main) {
-  let state = await get('/booth');
+  const look = () => Promise.all([get('/booth'), get('/task')]);
+  let state;
+  let checking;
+  const take = ([found, task]) => { state = found; checking = task.running && task.kind === 'check'; };
+  take(await look());
   const cameras = new Cameras(state.cameras.map((camera) => camera.name));
   const power = h('button', { id: 'power', onclick: () => switchSensors() });
   const facts = h('dl', { className: 'facts' });
@@ -35,12 +39,13 @@ export async function booth(main) {
   }
 
   async function check() {
-    checkButton.disabled = true;
-    checkText.textContent = t('booth.checking');
+    checking = true;
+    show();
     try {
       await post('/booth/check', {}, { 'Idempotency-Key': freshKey() });
     } catch (error) {
       notice(error.message, true);
+      checking = false;
       show();
     }
   }
@@ -69,7 +74,9 @@ export async function booth(main) {
       h('dd', { className: value.length > 12 ? 'wide' : '' }, value)]));
     showTroubles(state);
     const last = state.last_check;
-    checkText.textContent = last === null ? t('booth.never') : `${time(last.time)} – ${checked(last)}`;
+    const ended = last === null ? t('booth.never') : `${time(last.time)} – ${checked(last)}`;
+    checkText.textContent = checking ? t('booth.checking') : ended;
+    checkButton.disabled = checking;
     const waiting = state.waiting_deliveries;
     deliveries.hidden = waiting.length === 0;
     deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
@@ -79,7 +86,7 @@ export async function booth(main) {
 
   async function refresh() {
     try {
-      state = await get('/booth');
+      take(await look());
       show();
     } catch { /* the connection's loss is told elsewhere */ }
   }
@@ -108,9 +115,9 @@ export async function booth(main) {
       state.framesets_hz = data.rate_hz;
       state.streaming = data.streaming;
       show();
-    } else if (kind === 'calibration' && data.kind === 'check' && !data.running) {
-      checkButton.disabled = false;
-      if (data.error) notice(said(data.error), true);
+    } else if (kind === 'calibration' && data.kind === 'check') {
+      checking = data.running;
+      if (!checking && data.error) notice(said(data.error), true);
       refresh();
     } else if (kind !== 'scan') refresh();
   });
