@@ -13,7 +13,7 @@ from station.administration.booth_file import CONFIG, STATE_FOLDER, administrati
 from station.administration.migrate import migrate
 from station.administration.ownership import USER, give_to_booth, is_installed_root
 from station.core.commands import config_option
-from station.core.config_file import find_config, load_config
+from station.core.config_file import find_config, load_config, option_for
 from station.core.errors import ConfigError
 
 
@@ -43,7 +43,7 @@ def restore(backup: Path, config_path: Path | None) -> None:
         click.echo("what was there before is kept until you delete it:")
     for place in kept:
         click.echo(f"  {place}")
-    click.echo("next: station setup" if path == CONFIG else "next: station run")
+    click.echo("next: station setup" if path == CONFIG else f"next: station run{option_for(path)}")
 
 
 def _runtime_folder(path: Path) -> Path:

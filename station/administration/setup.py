@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import shlex
 import shutil
 import subprocess
 import sys
@@ -33,7 +32,7 @@ from station.administration.ownership import USER, give_to_booth, is_installed_r
 from station.console.security.vault import Vault
 from station.core.commands import at_most_one, config_option
 from station.core.config import BoothConfig
-from station.core.config_file import find_config, load_config
+from station.core.config_file import find_config, load_config, option_for
 from station.core.drivers import CameraConfig
 from station.core.errors import BoothError, ConfigError, DriverError
 from station.core.files import write_bytes
@@ -255,7 +254,7 @@ def compare_sensors(named: Sequence[str], connected: Sequence[str]) -> list[str]
 def _what_is_left(config: BoothConfig, path: Path, *, started: bool) -> list[str]:
     left: list[str] = []
     installed = path == CONFIG
-    named = "" if find_config(None).resolve() == path else f" --config {shlex.quote(str(path))}"
+    named = option_for(path)
     physical = [c.serial for c in config.cameras if isinstance(c, FreenectCamera) and c.serial]
     if physical:
         left += compare_sensors(physical, serial_numbers())

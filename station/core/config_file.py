@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -41,6 +42,12 @@ def find_config(path: Path | None) -> Path:
     if path is not None:
         return path
     return Path(os.environ.get(ENVIRONMENT_VARIABLE, DEFAULT_PATH))
+
+
+def option_for(path: Path) -> str:
+    """The option that names a configuration to a command, with a space before it; empty if the
+    command finds it itself."""
+    return "" if find_config(None).resolve() == path else f" --config {shlex.quote(str(path))}"
 
 
 def load_config(path: Path) -> BoothConfig:

@@ -205,8 +205,10 @@ def test_what_was_saved_comes_back_on_another_machine(
     if not with_scans:
         del expected["spool/outbox/scan-1/mesh.ply"]
     other = tmp_path / "other/booth.toml"
-    _run(restore, saved, "--config", other)
+    done = _run(restore, saved, "--config", other)
     assert _content(other.parent) == expected
+    # Without the option it would not be found.
+    assert done.endswith(f"next: station run --config {other}\n")
 
 
 def test_a_backup_goes_to_a_drive_that_is_there_and_says_what_it_lacks(
