@@ -8,7 +8,8 @@ import logging
 import socket
 import threading
 from collections import Counter
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import uvicorn
@@ -100,8 +101,9 @@ class CountedWebSocket(WebSocketsSansIOProtocol):
 class _Server(uvicorn.Server):
     """uvicorn's server, which leaves signals to the process: streams have to end first."""
 
-    def capture_signals(self) -> AbstractContextManager[None]:
-        return nullcontext()
+    @contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        yield
 
 
 def check_exposure(config: ConsoleConfig, has_password: bool) -> bool:
