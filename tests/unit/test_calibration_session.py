@@ -75,6 +75,19 @@ def test_the_ball_waved_anew_replaces_the_old_one_in_one_line(tmp_path: Path) ->
     assert Session.load(tmp_path).balls == []
 
 
+def test_a_line_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    """Whoever only looks must not cut it off."""
+    session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)
+    session.record_empty({}, [])
+    journal = tmp_path / JOURNAL
+    journal.write_bytes(journal.read_bytes() + b'{"step":"ma')
+    before = journal.read_bytes()
+    assert Session.load(tmp_path, mend=False).done(EMPTY)
+    assert journal.read_bytes() == before
+    Session.load(tmp_path)
+    assert journal.read_bytes() != before
+
+
 def test_a_line_that_was_cut_off_costs_only_itself(tmp_path: Path) -> None:
     """kill -9 in the middle of a write."""
     session = Session.begin(tmp_path, STARTED, 0.1, CAMERAS)

@@ -36,10 +36,10 @@ class Attempt:
     """DIR/<step>/<camera> in place of the live cameras."""
     guide: Guide
 
-    def unfinished_session(self) -> Session | None:
-        """The calibration that is being done, if one is."""
+    def unfinished_session(self, *, mend: bool = True) -> Session | None:
+        """The calibration that is being done, if one is; ``mend``: as in `Session.load`."""
         folder = self.store.unfinished
-        return Session.load(folder) if (folder / SESSION).exists() else None
+        return Session.load(folder, mend=mend) if (folder / SESSION).exists() else None
 
     def session(self) -> Session:
         """The calibration that is being done.

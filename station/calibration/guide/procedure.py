@@ -61,40 +61,57 @@ class Procedure(Attempt):
             )
             self.guide.say(f"already recorded: {session.summary()}")
             self.guide.say("to repeat a step, run its own command")
-        if session is None or not session.done(EMPTY):
+        done = self.finished(session)
+        if "floor" not in done:
             self.empty()
-        if session is None or not self._waved(session):
+        if "ball" not in done:
             self.ball()
-        if session is None or not session.done(MARK):
+        elif session is not None and (words := self._waved(session)):
+            self.guide.say(words)
+        if "mark" not in done:
             self.rest(MARK)
         recorded_front = self.recordings is not None and (self.recordings / FRONT).is_dir()
         if recorded_front and (session is None or not session.done(FRONT)):
             self.rest(FRONT)
-        if session is None or session.around_count < len(_AROUND):
+        if "around" not in done:
             self.around(asked=True)
         see_all_heights(self)
-        if session is None or session.wall_count < _BOARDS:
+        if "depth" not in done:
             self.walls(asked=True)
         self.solve()
 
-    def _waved(self, session: Session) -> bool:
-        """Whether the ball was waved enough, or as long as is asked for or recorded: then a camera
-        may lack something that more of it would not show."""
+    def finished(self, session: Session | None) -> list[str]:
+        """Commands of the steps that are done, in a calibration that is being done."""
+        if session is None:
+            return []
+        done = {
+            "floor": session.done(EMPTY),
+            "ball": self._waved(session) is not None,
+            "mark": session.done(MARK),
+            "around": session.around_count >= len(_AROUND),
+            "stand": session.raised_enough,
+            "depth": session.wall_count >= _BOARDS,
+        }
+        return [step for step, is_done in done.items() if is_done]
+
+    def _waved(self, session: Session) -> str | None:
+        """Words on a ball that was waved enough (none), or as long as is asked for or recorded:
+        then a camera may lack something that more of it would not show. None: it was not."""
         coverage = coverage_so_far(session, self.config.reference)
         if coverage.enough:
-            return True
+            return ""
         over = (
             session.waved_s >= self.config.calibrate.waving_s
             if self.recordings is None
-            else session.replayed == fingerprint(step_folder(self.recordings, BALL))
+            else (self.recordings / BALL).is_dir()
+            and session.replayed == fingerprint(step_folder(self.recordings, BALL))
         )
-        if not over:
-            return False
-        self.guide.say(
+        return (
             f"the ball was waved for {session.waved_s} s; more of it would help (station "
             f"calibrate ball): {coverage.advice()}"
+            if over
+            else None
         )
-        return True
 
     def _check_recordings(self) -> None:
         """Recorded steps are of all cameras: one that is missing is not found out minutes later."""

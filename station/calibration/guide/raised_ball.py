@@ -45,7 +45,7 @@ def see_all_heights(attempt: Attempt, *, again: bool = False, kind: str | None =
         kind: list(session.raised_as(kind).values()) if session and not again else []
         for kind in RAISED
     }
-    complete = any(len(own) >= len(HEIGHTS_M[kind]) for kind, own in seen.items())
+    complete = session is not None and session.raised_enough and not again
     if complete or not attempt.guide.attended:
         return
     attempt.check_station()

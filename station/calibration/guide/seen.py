@@ -159,6 +159,11 @@ class Seen:
         }
 
     @property
+    def raised_enough(self) -> bool:
+        """Whether the ball was seen at both heights on a stand, or hanging."""
+        return any(len(self.raised_as(kind)) >= len(HEIGHTS_M[kind]) for kind in RAISED)
+
+    @property
     def wall_count(self) -> int:
         return sum(name.startswith(WALL) for name in self.planes)
 

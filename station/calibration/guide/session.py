@@ -90,8 +90,11 @@ class Session(Seen):
         return str(read_json(folder / SESSION, format=FORMAT, versions=VERSIONS).get("started"))
 
     @classmethod
-    def load(cls, folder: Path) -> Session:
+    def load(cls, folder: Path, *, mend: bool = True) -> Session:
         """Read what an interrupted calibration has seen.
+
+        Args:
+            mend: cut off a line that was not written whole; not where it may be being written.
 
         Raises:
             FormatError: naming the file, the line and what is wrong with it.
@@ -110,7 +113,7 @@ class Session(Seen):
             ) from None
         session = cls(started, radius_m, sensors.cameras, folder=folder)
         session.adds_to = str(document.get("adds_to", ""))
-        session._replay_journal()
+        session._replay_journal(mend=mend)
         return session
 
     def background(self, camera: str) -> StaticView | None:
@@ -175,13 +178,13 @@ class Session(Seen):
             fsync_folder(self.folder)
         self._take(entry)
 
-    def _replay_journal(self) -> None:
+    def _replay_journal(self, *, mend: bool) -> None:
         path = self.folder / JOURNAL
         if not path.exists():
             return
         data = path.read_bytes()
         whole = data[: data.rfind(b"\n") + 1]
-        if len(whole) < len(data):
+        if mend and len(whole) < len(data):
             # The process died while it wrote this line: what it held was seen in the last second.
             os.truncate(path, len(whole))
         for number, line in enumerate(whole.splitlines(), start=1):

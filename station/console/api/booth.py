@@ -8,6 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from station.booth.session import MAX_LABEL_LENGTH
 from station.calibration.drift.last_check import last_check
 from station.calibration.guide.store import CalibrationStore, Entry
 from station.console.api.console import (
@@ -34,6 +35,7 @@ from station.console.api.models import (
     Session,
     Streaming,
     Task,
+    Unfinished,
 )
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import command
@@ -130,6 +132,7 @@ def _session(console: Console, caller: Caller | None) -> Session:
         unit=config.unit,
         countdown_s=config.countdown_s,
         recordings=config.recordings is not None,
+        label_length=MAX_LABEL_LENGTH,
     )
 
 
@@ -190,6 +193,16 @@ def answer(body: Answer, console: Booth, caller: Manager) -> Task:  # noqa: ARG0
     """Answer "go", "yes" or "no" to the waiting task; a height is answered "yes" and `height_m`."""
     height = body.answer == "yes" and body.height_m is not None
     return Task(**console.tasks.answer(str(body.height_m) if height else body.answer))
+
+
+@router.get("/calibration", responses=responses(409), tags=["calibration"])
+def unfinished(console: Booth, caller: Reader) -> Unfinished:  # noqa: ARG001
+    """Steps that are done of the calibration that is being done."""
+    # A calibration's mathematics takes seconds to load, and few look at this.
+    from station.console.live.guided import unfinished
+
+    started, done = unfinished(console.config)
+    return Unfinished(started=started, done=done)
 
 
 @router.post("/calibration", status_code=202, responses=responses(409), tags=["calibration"])

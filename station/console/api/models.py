@@ -37,6 +37,7 @@ class Session(BaseModel):
     unit: Literal["cm", "in"]
     countdown_s: int
     recordings: bool = Field(description="calibrations replay recordings")
+    label_length: int = Field(description="letters that a label may have")
 
 
 class Camera(BaseModel):
@@ -238,6 +239,13 @@ class Calibration(BaseModel):
     cameras: list[str]
     residual_rms_mm: float
     in_use: bool
+
+
+class Unfinished(BaseModel):
+    """The calibration that is being done."""
+
+    started: str = Field(description="ISO 8601, UTC; empty if none is being done")
+    done: list[str] = Field(description="steps of `POST /calibration` that are done")
 
 
 class CameraShift(BaseModel):

@@ -15,6 +15,7 @@ from station.calibration.guide.operator import Guide
 from station.calibration.guide.procedure import Procedure
 from station.calibration.guide.raised_ball import see_all_heights
 from station.calibration.guide.store import CalibrationStore
+from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError, CalibrationError
 
@@ -103,6 +104,19 @@ def run(config_path: Path, step: str, new: bool) -> None:
         raise CalibrationError(f"stopped; {procedure.kept()}") from None
     if alone:
         guide.say(procedure.following("the computation puts it into use"))
+
+
+def unfinished(config: BoothConfig) -> tuple[str, list[str]]:
+    """Start of the calibration that is being done, and its steps that are done; empty if none
+    is. It may be going on.
+
+    Raises:
+        FormatError: what it saw cannot be read.
+    """
+    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    procedure = Procedure(config, store, config.console.recordings, PageGuide(False, 0.0))
+    session = procedure.unfinished_session(mend=False)
+    return ("", []) if session is None else (session.started, procedure.finished(session))
 
 
 def _do(procedure: Procedure, step: str) -> None:

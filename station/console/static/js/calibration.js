@@ -23,6 +23,20 @@ export async function calibration(main, session) {
   };
   const say = async (word, more = {}) => { try { show(await post('/task/answer', { answer: word, ...more })); } catch (error) { notice(error.message, true); } };
   const halt = async () => { try { show(await remove('/task')); } catch (error) { notice(error.message, true); } };
+  const marks = new Map();
+  const mark = (step) => { const one = h('span', { className: 'chip good', 'data-done': step, hidden: true }, t('cal.done')); marks.set(step, one); return one; };
+  async function progress() {
+    const found = await get('/calibration');
+    for (const [step, one] of marks) one.hidden = !found.done.includes(step);
+    return found;
+  }
+  const anew = async () => {
+    try {
+      const { started } = await progress();
+      if (started && !await ask(t('cal.new'), t('cal.sureNew', { time: time(started) }), t('cal.new'), t('cancel'), true)) return;
+    } catch { /* one that cannot be read is begun anew */ }
+    await begin('all', true);
+  };
   const buttons = [];
   const button = (step) => { const one = h('button', { 'data-step': step, onclick: () => begin(step), 'aria-label': `${t('cal.do')}: ${t(`cal.${step}`)}` }, t('cal.do')); buttons.push(one); return one; };
 
@@ -35,7 +49,7 @@ export async function calibration(main, session) {
       session.recordings ? h('p', { className: 'soft' }, t('cal.recordings')) : '',
       h('div', { className: 'actions left' },
         h('button', { className: 'primary', id: 'calibrate', onclick: () => begin('all') }, t('cal.continue')),
-        h('button', { id: 'anew', onclick: () => begin('all', true) }, t('cal.new'))),
+        h('button', { id: 'anew', onclick: anew }, t('cal.new'))),
       tell ? h('div', { className: 'log', id: 'log' }, task.lines.map((line) => h('div', {}, said(line)))) : '');
   }
 
@@ -106,16 +120,20 @@ export async function calibration(main, session) {
       h('div', { className: 'stack' },
         h('section', { className: 'card' }, h('h2', {}, t('cal.steps')), h('ol', { className: 'steps' }, STEPS.map((step, i) =>
           h('li', {}, h('span', { className: 'n' }, String(i + 1)), h('span', { className: 'text' }, h('b', {}, t(`cal.${step}`)),
-            h('span', { className: 'small soft' }, t(`cal.${step}.what`))), button(step))))),
+            h('span', { className: 'small soft' }, t(`cal.${step}.what`))), mark(step), button(step))))),
         stored)));
   show(await get('/task'));
   await list();
+  progress().catch(() => {});
   let busy = false;
+  let title = '';
   const silence = listen((kind, data) => {
     if (kind === 'camera') cameras.state(data);
     if (kind !== 'calibration') return;
     show(data);
     if (busy && !data.running) list().catch(() => {});
+    if (busy !== data.running || title !== data.title) progress().catch(() => {});
+    title = data.title;
     busy = data.running;
   });
   return () => { silence(); cameras.close(); };
