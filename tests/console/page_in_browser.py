@@ -311,7 +311,7 @@ def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) 
     page.goto(console.url)
     page.select_option("#language", "zh")
     expect(page.locator("h1")).to_have_text("扫描", timeout=20_000)
-    assert page.evaluate("document.documentElement.lang") == "zh-CN"
+    expect(page.locator("html")).to_have_attribute("lang", "zh-CN")
     open_view(page, console, f"result/{scans[0]['scan_id']}")
     expect(page.locator("tr[data-name=waist_girth]")).to_contain_text("腰围", timeout=20_000)
     expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)

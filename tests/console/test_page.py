@@ -5,12 +5,19 @@ page_in_browser.py has every other view and what goes wrong; `make test-console`
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
+import time
 from typing import Any
 
 from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
 from live_console import LiveConsole
 from playwright.sync_api import expect
 
+from station.calibration.guide.session import Session
+from station.calibration.guide.store import UNFINISHED
+from station.core.rig import Rig
 from station.handover.ledger import Ledger, Waiting
 
 _NOTE_WORDS = """() => {
@@ -113,3 +120,87 @@ def test_copies_that_stay_are_told_before_a_scan_is_deleted(
                 dialog.get_by_role("button", name="Cancel").click()
         finally:
             ledger.forget(scan_id)
+
+
+def test_another_language_says_the_same(console: LiveConsole) -> None:
+    """The outcome of a scan was gone."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "scan")
+        expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
+        page.click("#go")
+        page.click("#give-up")
+        ended = page.locator("#verdict h2")
+        expect(ended).to_have_text("The scan was cancelled", timeout=LONG_MS)
+        page.select_option("#language", "zh")
+        expect(ended).to_have_text("扫描已取消", timeout=LONG_MS)
+        expect(page.locator("html")).to_have_attribute("lang", "zh-CN")
+        page.select_option("#language", "en")
+        expect(ended).to_have_text("The scan was cancelled", timeout=LONG_MS)
+        open_view(page, console, "history")
+        expect(page.locator("#search")).to_be_visible(timeout=LONG_MS)
+        open_view(page, console, "scan")
+        expect(page.locator("#label")).to_be_visible(timeout=LONG_MS)
+
+
+def test_nobody_is_said_to_be_absent_whom_no_camera_sees(console: LiveConsole) -> None:
+    with browser() as started, console.client() as client:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "scan")
+        presence = page.locator("main [role=status]")
+        expect(presence).to_have_text("Somebody is in the booth", timeout=LONG_MS)
+        fronts = [console.station.pids("capture", f"front-{end}")[0] for end in ("lower", "upper")]
+        for pid in fronts:
+            os.kill(pid, signal.SIGSTOP)
+        unseen = "The cameras cannot see whether somebody is in the booth."
+        expect(presence).to_have_text(unseen, timeout=LONG_MS)
+        # What hangs is killed and started again.
+        expect(presence).to_have_text("Somebody is in the booth", timeout=LONG_MS)
+        client.post("/booth/stop").raise_for_status()
+        try:
+            expect(presence).to_have_text("The sensors are off.", timeout=LONG_MS)
+        finally:
+            console.start_sensors()
+
+
+def test_a_check_is_told_while_it_runs(console: LiveConsole) -> None:
+    """The next frameset put the last result in its place."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "booth")
+        told = page.locator("section:has(#check) p").first
+        words = set()
+        page.click("#check")
+        with console.client("read") as client:
+            while client.get("/task").json()["running"]:
+                words.add(told.inner_text())
+                time.sleep(0.2)
+        expect(page.locator("#check")).to_be_enabled(timeout=LONG_MS)
+        expect(told).not_to_have_text("Checking …")
+    assert words == {"Checking …"}
+
+
+def test_a_calibration_that_was_begun_is_shown_and_not_lost_by_a_touch(
+    console: LiveConsole,
+) -> None:
+    unfinished = console.config.calibrate.folder / UNFINISHED
+    with browser() as started, console.client() as client:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        assert client.get("/calibration").json() == {"started": "", "done": []}
+        cameras = Rig.load(console.config.calibration).cameras
+        try:
+            Session.begin(unfinished, "2026-11-21T10:00:00Z", 0.1, cameras).record_empty({}, [])
+            open_view(page, console, "calibration")
+            expect(page.locator("[data-done=floor]")).to_be_visible(timeout=LONG_MS)
+            expect(page.locator("[data-done=ball]")).to_be_hidden()
+            page.click("#anew")
+            dialog = page.get_by_role("dialog")
+            expect(dialog).to_contain_text("Put aside the calibration", timeout=LONG_MS)
+            dialog.get_by_role("button", name="Cancel").click()
+            assert client.get("/calibration").json()["done"] == ["floor"]
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)

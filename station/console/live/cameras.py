@@ -52,7 +52,8 @@ class Pictures:
     async def next(self) -> bytes:
         """The next pictures of all cameras: a length, a JSON header of that length, JPEG files.
 
-        The header's `cameras` lists name, bytes and somebody, in the files' order.
+        The header's `cameras` lists name, bytes and somebody (null: it cannot be seen), in the
+        files' order.
         """
         future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         with self._lock:
@@ -109,7 +110,7 @@ class Pictures:
         listed, files = [], []
         for name in self._names:
             if name not in newest:
-                listed.append({"name": name, "bytes": 0, "somebody": False})
+                listed.append({"name": name, "bytes": 0, "somebody": None})
                 continue
             packed, pixels = newest[name]
             header = FrameHeader.unpack(packed.buffer)

@@ -35,8 +35,11 @@ class PictureMaker:
         self._rays: NDArray[np.float32] | None = None
         self._offset = np.zeros(3, np.float32)
 
-    def draw(self, depth: NDArray[np.uint16], scale_m: float) -> tuple[NDArray[np.uint8], bool]:
-        """A picture (h / 2, w / 2, 3) in OpenCV's order, and whether somebody is in the volume."""
+    def draw(
+        self, depth: NDArray[np.uint16], scale_m: float
+    ) -> tuple[NDArray[np.uint8], bool | None]:
+        """A picture (h / 2, w / 2, 3) in OpenCV's order, and whether somebody is in the volume;
+        None before the booth is calibrated."""
         z = depth[::STRIDE_PX, ::STRIDE_PX].astype(np.float32) * np.float32(scale_m)
         known = z > 0
         levels = np.clip((z - _NEAR_M) * (_LEVELS / (_FAR_M - _NEAR_M)), 0, _LEVELS - 1)
@@ -48,10 +51,11 @@ class PictureMaker:
         outline = None if self._camera is None else _outline_of(person)
         if outline is not None:
             picture[outline] = _OUTLINE
-        return np.asarray(picture, np.uint8), outline is not None
+        somebody = None if self._camera is None else outline is not None
+        return np.asarray(picture, np.uint8), somebody
 
-    def jpeg(self, depth: NDArray[np.uint16], scale_m: float) -> tuple[bytes, bool]:
-        """The picture as JPEG."""
+    def jpeg(self, depth: NDArray[np.uint16], scale_m: float) -> tuple[bytes, bool | None]:
+        """The same as JPEG."""
         picture, somebody = self.draw(depth, scale_m)
         _, packed = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return packed.tobytes(), somebody

@@ -27,10 +27,7 @@ let turn = 0;
 function drawRail() {
   rail.setAttribute('aria-label', t('nav.main'));
   rail.hidden = false;
-  const languages = h('select', { id: 'language', 'aria-label': t('nav.language'), onchange: (event) => {
-    setLanguage(event.target.value);
-    location.reload();
-  } }, h('option', { value: 'en' }, 'English'), h('option', { value: 'zh' }, '简体中文'));
+  const languages = h('select', { id: 'language', 'aria-label': t('nav.language'), onchange: (event) => speak(event.target.value) }, h('option', { value: 'en' }, 'English'), h('option', { value: 'zh' }, '简体中文'));
   languages.value = currentLanguage();
   rail.replaceChildren(
     ...RAIL.map((name) => h('a', { href: `#/${name}`, 'data-view': name }, icon(name), h('span', {}, t(`nav.${name}`)))),
@@ -38,6 +35,20 @@ function drawRail() {
     h('a', { href: '/person', target: '_blank', rel: 'noopener' }, icon('person'), h('span', {}, t('nav.person'))),
     languages,
     session.password_set ? h('button', { id: 'logout', onclick: logOut }, t('nav.logout')) : '');
+}
+
+// Without loading the page anew: what it tells of a scan, and its notices, stay.
+async function speak(language) {
+  setLanguage(language);
+  await load(session.language);
+  drawRail();
+  document.getElementById('language').focus();
+  show();
+}
+
+async function load(fallback) {
+  await loadWords(fallback);
+  document.getElementById('skip').textContent = t('app.skip');
 }
 
 async function logOut() {
@@ -108,6 +119,5 @@ window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
 VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for
 const found = await get('/session');
-await loadWords(found.language);
-document.getElementById('skip').textContent = t('app.skip');
+await load(found.language);
 if (found.logged_in) enter(found); else leaveForLogin();

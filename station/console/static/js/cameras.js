@@ -54,7 +54,13 @@ export class Cameras {
       context.fillText(t('camera.pause'), width / 2, height / 2);
     }
     this.present.set(name, somebody);
-    if (this.onpresence) this.onpresence([...this.present.values()].some(Boolean));
+    if (this.onpresence) this.onpresence(this.somebody());
+  }
+
+  // Whether any camera sees somebody; null if none can tell.
+  somebody() {
+    const seen = [...this.present.values()].filter((somebody) => somebody !== null);
+    return seen.length ? seen.some(Boolean) : null;
   }
 
   close() { this.pictures.close(); }

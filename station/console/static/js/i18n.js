@@ -12,7 +12,7 @@ export async function loadWords(fallback) {
   language = catalogue[kept] ? kept : (fallback || 'en');
   words = catalogue[language];
   document.documentElement.lang = language === 'zh' ? 'zh-CN' : 'en';
-  if (language === 'zh') phrases = compiled(await (await fetch('/static/phrases.json')).json());
+  phrases = language === 'zh' ? compiled(await (await fetch('/static/phrases.json')).json()) : [];
 }
 
 // What the station says (a reason, a remedy, an error) in the reader's language. The same rules as

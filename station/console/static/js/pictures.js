@@ -4,7 +4,8 @@
 const RETRY_MS = 1000;
 
 export class Pictures {
-  // draw(name, bitmap or null, somebody) is called for each camera.
+  // draw(name, bitmap or null, somebody) is called for each camera; somebody is null where it cannot
+  // be seen.
   constructor(draw) {
     this.draw = draw;
     this.closed = false;
@@ -27,7 +28,7 @@ export class Pictures {
     const { cameras } = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
     let at = 4 + size;
     for (const camera of cameras) {
-      if (!camera.bytes) { this.draw(camera.name, null, false); continue; }
+      if (!camera.bytes) { this.draw(camera.name, null, null); continue; }
       const file = new Blob([new Uint8Array(data, at, camera.bytes)], { type: 'image/jpeg' });
       at += camera.bytes;
       const bitmap = await createImageBitmap(file);

@@ -5,13 +5,16 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { outcome, said, t, time } from './i18n.js';
+import { currentLanguage, outcome, said, t, time } from './i18n.js';
 import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
 const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
+
+// What the view told when it was left, in which language: it is told on in another one.
+let left = null;
 
 export async function scan(main, session) {
   const state = await get('/booth');
@@ -21,7 +24,10 @@ export async function scan(main, session) {
   for (const camera of state.cameras) cameras.state(camera);
   const [banner, showTroubles] = troubleBanner();
   const presence = h('p', { className: 'soft', role: 'status' });
-  cameras.onpresence = (somebody) => { presence.textContent = t(somebody ? 'scan.somebody' : 'scan.nobody'); };
+  cameras.onpresence = (somebody) => {
+    const unseen = streaming ? 'scan.unseen' : 'booth.off';
+    presence.textContent = t(somebody === null ? unseen : somebody ? 'scan.somebody' : 'scan.nobody');
+  };
   const stage = h('section', { className: 'card stage', id: 'stage', 'aria-live': 'polite' });
   let streaming = state.streaming;
   let able = state.can_scan;
@@ -29,13 +35,14 @@ export async function scan(main, session) {
   let label = '';
   let current = null;
   let pressed = 0;
+  let took = null;
   let timer = null;
   let parts = null;
 
   function ready() {
     current = null;
     clearInterval(timer);
-    const input = h('input', { type: 'text', id: 'label', value: label, maxLength: 200,
+    const input = h('input', { type: 'text', id: 'label', value: label, maxLength: session.label_length,
       placeholder: t('scan.placeholder'), autocomplete: 'off', enterKeyHint: 'go',
       onkeydown: (event) => { if (event.key === 'Enter') begin(); },
       oninput: () => { label = input.value; } });
@@ -67,6 +74,7 @@ export async function scan(main, session) {
     // The label's Enter comes here too.
     if (document.getElementById('go').disabled) return;
     pressed = performance.now();
+    took = null;
     asked = true;
     allow();
     try {
@@ -164,7 +172,7 @@ export async function scan(main, session) {
   function finish() {
     clearInterval(timer);
     const done = current;
-    const seconds = ((performance.now() - pressed) / 1000).toFixed(1);
+    took ??= ((performance.now() - pressed) / 1000).toFixed(1);
     const figure = bodyFigure();
     const cancelled = outcome(done) === 'cancelled';
     const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
@@ -175,7 +183,7 @@ export async function scan(main, session) {
         figure,
         h('div', {}, h('h2', {}, t(`scan.${cancelled ? 'cancelled' : look}`)), h('p', {}, done.label || t('result.noLabel')),
           done.reasons.length && !cancelled ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
-          done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: seconds })))),
+          done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: took })))),
       h('div', { className: 'actions' },
         done.state === 'failed' ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
         again,
@@ -228,7 +236,17 @@ export async function scan(main, session) {
         h('section', { className: 'card' }, h('h2', {}, t('scan.last')), list))));
   showTroubles(state);
   const looking = setInterval(look, TROUBLES_MS);
+  const language = currentLanguage();
+  if (left && left.language !== language) ({ label, pressed, took } = left);
   ready();
+  if (left && left.language !== language && left.current) follow(left.current);
+  left = null;
   latest();
-  return () => { clearInterval(timer); clearInterval(looking); silence(); cameras.close(); };
+  return () => {
+    left = { language, label, pressed, took, current };
+    clearInterval(timer);
+    clearInterval(looking);
+    silence();
+    cameras.close();
+  };
 }
