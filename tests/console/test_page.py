@@ -30,7 +30,8 @@ _NOTE_WORDS = """() => {
 }"""
 """Keeps what the scan's ring says, one after the other."""
 _IN_ORDER = ["Hold still", "Storing", "In the queue", "Measuring the body"]
-"""It went back to "Hold still" after the pictures were taken."""
+"""It went back to "Hold still" after the pictures were taken, and to "In the queue" where the
+body was measured already."""
 
 
 def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> None:
@@ -44,6 +45,10 @@ def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> N
         page.fill("#label", "Order 5")
         page.evaluate(_NOTE_WORDS)
         page.click("#go")
+        expect(page.locator("#stage .word")).to_have_text(_IN_ORDER[-1], timeout=5 * LONG_MS)
+        # A job that dies is done again, of which the operator needs to know nothing.
+        for pid in console.station.pids("workers.reconstruct.job_process"):
+            os.kill(pid, signal.SIGKILL)
         verdict = page.locator("#verdict")
         expect(verdict).to_be_visible(timeout=5 * LONG_MS)
         told = [word for word in page.evaluate("window.told") if word in _IN_ORDER]

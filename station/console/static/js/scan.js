@@ -115,6 +115,8 @@ export async function scan(main, session) {
     if (!current || FINAL.includes(current.state)) return;
     const before = current.state;
     current = { ...current, ...found };
+    // "accepted" may be late, or a failed job's, which is done again at once.
+    if (before === 'reconstructing' && found.state === 'accepted') current.state = before;
     if (found.state !== 'countdown' || more.left_s !== undefined) show(more);
     if (FINAL.includes(current.state) && !FINAL.includes(before)) finish();
   }
