@@ -16,7 +16,7 @@ from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import CameraCalibration, Rig
 from station.sensors.recording import RecordedFrame
 from station.simulation import violations
-from station.simulation.noise import TrueView, UnitError, observe
+from station.simulation.noise import NoiselessView, UnitError
 from station.simulation.scene import (
     Mesh,
     VirtualScene,
@@ -143,19 +143,19 @@ class VirtualCamera:
         self._body = body
         # One person, one sway: all cameras see the same phase.
         self._sway_phase = float(np.random.default_rng((booth.seed, 7, 7)).random())
-        self._views: dict[float, TrueView] = {}
+        self._views: dict[float, NoiselessView] = {}
 
     def frames(self, count: int) -> Iterator[VirtualFrame]:
         """Frames at 30 Hz of the unit's own clock; a dropped one leaves a gap in the sequence."""
         for sequence in range(count):
             time_s = self.unit.phase_s + sequence / FRAME_RATE_HZ
-            raw = observe(self._view(time_s), self.unit.error, self._rng)
+            raw = self._view(time_s).read(self._rng)
             if self._rng.random() < self._booth.drop_rate:
                 continue
             yield VirtualFrame(time_s, self.unit.ticks(time_s), sequence, raw)
 
-    def _view(self, time_s: float) -> TrueView:
-        """The view of a perfect sensor at a time, rendered once for each lean."""
+    def _view(self, time_s: float) -> NoiselessView:
+        """The view without noise at a time, rendered once for each lean."""
         booth, camera = self._booth, self._camera
         turns = time_s / _SWAY_PERIOD_S + self._sway_phase
         sway_m = 0.0 if self._body is None else booth.sway_m
@@ -170,7 +170,8 @@ class VirtualCamera:
                 meshes.append(_leaning(self._body, lean_m))
             if not meshes:
                 raise InputError("the virtual booth holds nothing to look at")
-            self._views[lean_m] = VirtualScene(meshes).view(camera, pose)
+            view = VirtualScene(meshes).view(camera, pose)
+            self._views[lean_m] = NoiselessView.of(view, self.unit.error)
         return self._views[lean_m]
 
 
