@@ -79,7 +79,7 @@ def test_a_results_tables_are_printed_with_their_intervals(
     )
     assert json.loads(_run(str(tmp_path), "--json", "--pose", "standard"))["pose"] == "standard"
     table = _run(str(tmp_path)).splitlines()
-    assert table[:2] == ["verdict: scan again", "reason: the left arm is hidden"]
+    assert table[:2] == ["verdict: rescan", "reason: the left arm is hidden"]
     assert any(line.startswith("Hand length, left ") and "not measured" in line for line in table)
     both = CliRunner().invoke(measure, [str(tmp_path), "--json", "--csv"])
     assert both.exit_code == 2

@@ -15,7 +15,6 @@ import click
 from station.core.commands import writable_folder
 from station.core.errors import InputError
 from station.core.files import PRIVATE_FOLDER_MODE, publish_folder
-from station.core.words.terms import verdict_words
 from workers.scape.fit.fit import Method
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def fit(
         _publish(temporary, out_folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    click.echo(f"{out_folder}: {verdict_words(summary.status)}")
+    click.echo(f"{out_folder}: {summary.status}")
     for reason in summary.reasons:
         click.echo(f"  {reason}")
     if not quiet:

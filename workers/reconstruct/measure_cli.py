@@ -14,7 +14,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from station.core.commands import at_most_one
 from station.core.errors import FormatError, InputError
 from station.core.files import read_json
-from station.core.words.terms import plain_name, verdict_words
+from station.core.words.terms import plain_name
 
 _DIGITS = 5
 """Decimals in tables: hundredths of a millimetre, far below any interval."""
@@ -194,8 +194,7 @@ def _print_table(document: dict[str, Any]) -> None:
 
     words = {definition.name: definition.words for definition in DEFINITIONS}
     for name, text in _heading(document):
-        told = verdict_words(text) if name == "verdict" else text
-        click.echo(f"{name.replace('_', ' ')}: {_plain(told)}")
+        click.echo(f"{name.replace('_', ' ')}: {_plain(text)}")
     exact = not any(
         row["value_m"] is not None and row["interval95_m"][0] < row["interval95_m"][1]
         for row in document["measurements"]
