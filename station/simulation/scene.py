@@ -253,7 +253,7 @@ class VirtualScene:
         return TrueView(depth, incidence, lit, reflects)
 
     def _lit(self, world_from_camera: Array, away: Array) -> NDArray[np.bool_]:
-        """Which points (n, 3), from the camera, its projector reaches, a baseline beside it."""
+        """Mask of the points (n, 3), from the camera, that its projector beside it reaches."""
         projector = transform(world_from_camera, (BASELINE_M, 0.0, 0.0))
         towards = away - (projector - world_from_camera[:3, 3])
         towards *= 1.0 - _SHADOW_TOLERANCE_M / _lengths(towards)[:, None]
