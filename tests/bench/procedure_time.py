@@ -135,6 +135,7 @@ def procedure_seconds(*, extras: bool, hangs: bool = False) -> dict[str, float]:
         balls=(),
         raised=[],
         raised_as=lambda _: {},
+        raised_enough=False,
         wall_count=0,
     )
     config = SimpleNamespace(calibrate=wanted, reference="")

@@ -1,5 +1,6 @@
 """Messages to the operator when a camera is not as it should be."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -46,7 +47,9 @@ def test_a_camera_that_goes_silent_is_named_within_a_second(
     time.sleep(1.6)
     status = json.loads(station.command("status", "--json").stdout)
     refused = station.command("scan")
-    os.kill(victim, signal.SIGCONT)
+    # On a busy machine the station has ended it meanwhile, as a process that hangs.
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(victim, signal.SIGCONT)
     assert status["sync"]["silent"] == ["back-lower"]
     rates = {name: camera["rate_hz"] for name, camera in status["sync"]["cameras"].items()}
     assert [name for name, rate in rates.items() if rate is None] == ["back-lower"]
