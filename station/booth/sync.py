@@ -235,9 +235,9 @@ class SyncProcess:
         """Start a scan, or refuse it with the reason; the outcome is on disk either way."""
         if order.scan_id in self._in_hand():
             return
-        if order.late(time.monotonic()):
-            self._writer.refuse(order, LATE)
-        elif reason := CANCELLED if order.scan_id in self._cancelled else self._unready():
+        cancelled = CANCELLED if order.scan_id in self._cancelled else ""
+        late = LATE if order.late(time.monotonic()) else ""
+        if reason := cancelled or late or self._unready():
             self._writer.refuse(order, reason)
         else:
             self._order = order

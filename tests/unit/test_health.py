@@ -437,10 +437,12 @@ def test_a_scan_that_is_being_stored_is_told_as_such_when_it_is_cancelled(
         sync._context.destroy(linger=0)
 
 
-def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig) -> None:
+@pytest.mark.parametrize("late", [False, True])
+def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig, late: bool) -> None:
     """While sync restarted, the operator was told that the scan was not being taken; then it was
-    taken."""
+    taken, or said to have failed because its order came late."""
     later_s = time.monotonic() + 60.0
+    comes_s = 1.0 if late else later_s
     notes = Spool(config.spool.folder).notes
     sync = SyncProcess(config, logging.getLogger("sync"))
     try:
@@ -450,7 +452,7 @@ def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig) -> No
         )
         assert not sync._reply(Request("cancel", scan_id)).ok
         assert sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
-        assert sync._reply(Request("scan", scan_id, valid_until_s=later_s)).ok
+        assert sync._reply(Request("scan", scan_id, valid_until_s=comes_s)).ok
         while (note := notes.read(scan_id)) is None or note.stage == "armed":
             time.sleep(0.05)
         assert (note.stage, note.reason) == ("failed", CANCELLED)
