@@ -24,6 +24,7 @@ import sys
 import threading
 import time
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -240,10 +241,7 @@ class ControlProcess:
         if status["state"] == "failed":
             return Reply(ok=True, content=status)
         if status["state"] in ("armed", "capturing"):
-            note = self._spool.notes.read(scan_id)
-            if note is not None and note.stage == "armed" and note.boot == boot_id():
-                # It may overtake its order, which waits for a sync that restarts.
-                request = replace(request, valid_until_s=note.valid_until_s)
+            request = replace(request, valid_until_s=self._comes_until_s(scan_id))
             answer = ask(self._folder, "sync", request, _SYNC_TIMEOUT_S)
             if not answer.ok:
                 return answer
@@ -256,6 +254,15 @@ class ControlProcess:
                 f"{status['state']}); when it is done, delete it with: station purge {scan_id}",
             )
         return Reply(ok=True, content=self._scan_status(scan_id))
+
+    def _comes_until_s(self, scan_id: ScanId) -> float:
+        """Moment until which sync may get a scan's order after its cancel, which overtakes it while
+        sync restarts; 0 if it has it, or if the disk does not say."""
+        with suppress(OSError):
+            note = self._spool.notes.read(scan_id)
+            if note is not None and note.stage == "armed" and note.boot == boot_id():
+                return note.valid_until_s
+        return 0.0
 
     def _scan_status(self, scan_id: ScanId) -> dict[str, Any]:
         """A scan's state as the disk has it.

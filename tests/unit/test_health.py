@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from station.booth import control as control_module
 from station.booth.collection import Order
+from station.booth.control import ControlProcess
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
@@ -464,6 +467,32 @@ def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig, late:
     finally:
         sync._writer.close()
         sync._context.destroy(linger=0)
+
+
+def test_a_disk_that_cannot_be_read_is_not_in_the_way_of_a_cancel(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sync, which has the scan, was not asked."""
+
+    def torn(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    asked: list[Request] = []
+
+    def sync_answers(_: Path, __: str, request: Request, ___: float) -> Reply:
+        asked.append(request)
+        return Reply(ok=True)
+
+    path = config.calibration.parent / "booth.toml"
+    control = ControlProcess(config, path, logging.getLogger("control"))
+    monkeypatch.setattr(control_module, "ask", sync_answers)
+    monkeypatch.setattr(control._spool.notes, "read", torn)
+    try:
+        reply = control._reply(Request("cancel", "one"))
+    finally:
+        control._context.destroy(linger=0)
+    assert (reply.ok, reply.content["reason"]) == (True, CANCELLED)
+    assert [(request.command, request.scan_id) for request in asked] == [("cancel", "one")]
 
 
 def test_framesets_before_a_pause_do_not_count() -> None:
