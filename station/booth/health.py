@@ -155,9 +155,10 @@ def unusable(config: BoothConfig) -> str:
     """Words on a calibration that no scan can be taken with; empty if it is sound."""
     path = config.calibration
     try:
-        calibrated = _calibrated(path, version_of(path))
-    except FileNotFoundError:
-        return CalibrationStore(config.calibrate.folder, path).missing_words()
+        try:
+            calibrated = _calibrated(path, version_of(path))
+        except FileNotFoundError:
+            return CalibrationStore(config.calibrate.folder, path).missing_words()
     except (BoothError, OSError) as error:
         return str(error)
     return mismatch(calibrated, configured_serials(config.cameras))

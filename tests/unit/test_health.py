@@ -112,6 +112,13 @@ def test_a_lost_calibration_is_replaced_by_the_newest_that_is_kept(config: Booth
     assert str(refusal.value) == words
     checked = CliRunner().invoke(check, ["--config", str(path)])
     assert str(checked.exception) == words
+    # What is kept cannot be looked at: a problem like any other.
+    config.calibrate.folder.rename(moved := config.calibration.parent / "moved")
+    config.calibrate.folder.write_text("")
+    [words] = _problems(config, streaming=True, silent=[], cameras={})
+    assert "Not a directory" in words
+    config.calibrate.folder.unlink()
+    moved.rename(config.calibrate.folder)
     asked = ["--use", "20261120T100000Z", "--config", str(path)]
     assert CliRunner().invoke(calibrate, asked).exit_code == 0
     assert _problems(config, streaming=True, silent=[], cameras={}) == []
