@@ -77,13 +77,15 @@ class Ledger:
 
     def receivers(self, scan_id: str) -> list[str]:
         """Targets that have a copy of a scan's result; also those that booth.toml named before."""
-        return sorted(done.parent.parent.name for done in self._folder.glob(f"*/done/{scan_id}"))
+        places = self._folder.glob("*/done")
+        return sorted(place.parent.name for place in places if (place / scan_id).exists())
 
     def forget(self, scan_id: str) -> None:
         """Remove all that is kept of a scan that was deleted."""
-        for pattern in (f"*/done/{scan_id}", f"*/waiting/{scan_id}.json"):
-            for path in self._folder.glob(pattern):
-                path.unlink(missing_ok=True)
+        for place, name in (("done", scan_id), ("waiting", f"{scan_id}.json")):
+            # The name itself is no pattern: any folder may lie in the outbox.
+            for folder in self._folder.glob(f"*/{place}"):
+                (folder / name).unlink(missing_ok=True)
 
     def waiting(self) -> list[Waiting]:
         """All waiting results of all targets."""

@@ -16,7 +16,7 @@ from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver
-from station.handover.ledger import Ledger
+from station.handover.ledger import Ledger, Waiting
 from station.handover.targets import HandOverError, make_target
 
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
@@ -83,3 +83,13 @@ def test_a_damaged_result_keeps_no_other_back(tmp_path: Path) -> None:
     assert (waiting.scan_id, waiting.tries) == (_IDS[0], 1)
     assert "measurements" in waiting.error
     assert (tmp_path / "share" / _IDS[1] / "measurements.csv").exists()
+
+
+def test_the_name_of_a_deleted_folder_is_no_pattern(tmp_path: Path) -> None:
+    """Everything would have been handed over again."""
+    ledger = Ledger(tmp_path)
+    ledger.finish(Waiting("share", _IDS[0]))
+    ledger.keep(Waiting("orders", _IDS[0]))
+    ledger.forget("*")
+    assert ledger.receivers("2026*") == []
+    assert (ledger.receivers(_IDS[0]), len(ledger.waiting())) == (["share"], 1)
