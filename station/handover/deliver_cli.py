@@ -111,6 +111,9 @@ class HandOver:
             if entry.target == name and entry.due(now_s):
                 self._round_s[name] = time.monotonic()
                 self._try(entry, now_s)
+                if not self._spool.path("outbox", entry.scan_id).exists():
+                    # Deleted during the try, whose end was recorded after that.
+                    self._ledger.forget(entry.scan_id)
 
     def _try(self, entry: Waiting, now_s: float) -> None:
         scan: ScanRecord | None = self._index.get(entry.scan_id)

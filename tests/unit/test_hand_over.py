@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from station.archive.records import ScanRecord
+from station.booth.retention import purge_scan
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.spool import Spool
@@ -83,6 +84,28 @@ def test_a_damaged_result_keeps_no_other_back(tmp_path: Path) -> None:
     assert (waiting.scan_id, waiting.tries) == (_IDS[0], 1)
     assert "measurements" in waiting.error
     assert (tmp_path / "share" / _IDS[1] / "measurements.csv").exists()
+
+
+def test_a_scan_that_is_deleted_while_it_is_handed_over_waits_for_nobody(tmp_path: Path) -> None:
+    """Status told of it until the next result came."""
+    config = tmp_path / "booth.toml"
+    config.write_text(f'{_CAMERA}[[deliver]]\nname = "share"\nfolder = "share"\n')
+    spool = Spool(tmp_path / "spool")
+    for name in _IDS:
+        _result(spool.folder / "outbox" / name)
+    handover = HandOver(load_config(config), logging.getLogger("deliver"))
+
+    def deleted(scan: ScanRecord, result: Path) -> None:
+        purge_scan(spool, result.name)
+        if scan.scan_id == _IDS[0]:
+            raise HandOverError("it is gone")
+
+    handover._targets["share"] = deleted
+    handover.look()
+    handover.try_all("share", 1e9)
+    ledger = Ledger(spool.folder)
+    assert ledger.waiting() == []
+    assert [ledger.receivers(name) for name in _IDS] == [[], []]
 
 
 def test_the_name_of_a_deleted_folder_is_no_pattern(tmp_path: Path) -> None:
