@@ -237,18 +237,22 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         raise click.UsageError("give a scan id, --label or --old")
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
-    receivers = list[str]()
-    if old:
-        removed = expire_old(spool, config.retention)
-    else:
-        scans = [scan_id_of(scan_id)] if scan_id else _labelled(spool, str(label))
-        ledger = Ledger(spool.folder)
-        receivers = sorted({name for scan in scans for name in ledger.receivers(scan)})
-        removed = [folder for scan in scans for folder in purge_scan(spool, scan)]
-    for folder in removed:
-        click.echo(f"removed {folder}")
-    if receivers:
-        click.echo(f"copies handed over to {', '.join(receivers)} stay there")
+    removed, receivers = list[Path](), set[str]()
+    try:
+        if old:
+            removed = expire_old(spool, config.retention)
+        else:
+            scans = [scan_id_of(scan_id)] if scan_id else _labelled(spool, str(label))
+            for scan in scans:
+                copied_to = Ledger(spool.folder).receivers(scan)
+                removed += purge_scan(spool, scan)
+                receivers.update(copied_to)
+    finally:
+        # Also where a later scan cannot be deleted: nothing else knows of the copies any more.
+        for folder in removed:
+            click.echo(f"removed {folder}")
+        if receivers:
+            click.echo(f"copies handed over to {', '.join(sorted(receivers))} stay there")
     if old and not removed:
         click.echo("nothing is past its retention period")
     # Labels leave the index together with the scans, not at the next query.

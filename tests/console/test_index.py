@@ -361,6 +361,26 @@ def test_copies_that_were_handed_over_are_told_by_purge(spool: Spool) -> None:
     assert "copies handed" not in CliRunner().invoke(purge, [other, *option]).output
 
 
+def test_copies_are_told_where_another_scan_of_the_label_cannot_be_deleted(spool: Spool) -> None:
+    """Its refusal was all that was told, and whom the first one was handed over to was lost."""
+    option, ledger = _booth(spool), Ledger(spool.folder)
+    first, second = "20261121T100000Z-0001", ScanId("20261126T100000Z-0006")
+    spool.path("outbox", second).mkdir()
+    write_json(
+        spool.path("outbox", second) / "result.json", {"label": "Order 1234", "status": "ok"}
+    )
+    for name in (first, second):
+        ledger.finish(Waiting(f"to-{name[-1]}", name))
+    lock = spool.lock(second)
+    assert lock is not None
+    done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
+    spool.unlock(second, lock)
+    assert "is being reconstructed" in str(done.exception)
+    assert f"removed {spool.path('outbox', first)}\n" in done.output
+    assert done.output.endswith("copies handed over to to-1 stay there\n")
+    assert ledger.receivers(second) == ["to-6"]
+
+
 def test_what_is_removed_of_a_scan_that_was_never_stored_is_told(spool: Spool) -> None:
     """It was said that nothing was past its retention period."""
     option = _booth(spool)
