@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import os
+import resource
 import signal
 import socket
 import ssl
@@ -130,6 +131,17 @@ def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
     assert "console.sqlite" in last.json()["detail"]
     console.vault.close()
     console.audit.close()
+
+
+def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:
+    """The console ended with a traceback from sqlite whenever it was started."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(OSError, match=r"console\.sqlite"):
+            Vault(tmp_path / "console")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:

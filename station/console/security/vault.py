@@ -15,7 +15,8 @@ import sqlite3
 import threading
 import time
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -69,14 +70,13 @@ class Vault:
         self._folder = private_folder(folder)
         self._hasher = PasswordHasher()
         self._lock = threading.Lock()
-        self._database = sqlite3.connect(
-            private_file(folder / _DATABASE),
-            timeout=10,
-            isolation_level=None,
-            check_same_thread=False,
-        )
-        self._database.execute("PRAGMA journal_mode = WAL")
-        self._database.executescript(_SCHEMA)
+        self._path = private_file(folder / _DATABASE)
+        with _disk_told(self._path):
+            self._database = sqlite3.connect(
+                self._path, timeout=10, isolation_level=None, check_same_thread=False
+            )
+            self._database.execute("PRAGMA journal_mode = WAL")
+            self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
         self._database.close()
@@ -85,16 +85,10 @@ class Vault:
         """Run one statement.
 
         Raises:
-            OSError: the disk refuses; sqlite's own errors would not be told as such.
+            OSError: the disk refuses.
         """
-        try:
-            with self._lock:
-                return self._database.execute(query, values).fetchall()
-        except sqlite3.OperationalError as error:
-            code = _DISK_ERRORS.get(error.sqlite_errorcode & 0xFF)
-            if code is None:
-                raise
-            raise OSError(code, os.strerror(code), str(self._folder / _DATABASE)) from None
+        with _disk_told(self._path), self._lock:
+            return self._database.execute(query, values).fetchall()
 
     @property
     def has_password(self) -> bool:
@@ -194,6 +188,22 @@ class Vault:
     def forget(self, key: str) -> None:
         """Free an idempotency key: what it asked for was refused."""
         self._run("DELETE FROM keys WHERE key = ?", key)
+
+
+@contextmanager
+def _disk_told(path: Path) -> Iterator[None]:
+    """Work on a database whose errors of the disk are told as such; sqlite's own would not be.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        code = _DISK_ERRORS.get(error.sqlite_errorcode & 0xFF)
+        if code is None:
+            raise
+        raise OSError(code, os.strerror(code), str(path)) from None
 
 
 def _token(row: tuple[object, ...]) -> Token:
