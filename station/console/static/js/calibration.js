@@ -34,7 +34,10 @@ export async function calibration(main, session) {
     try {
       const { started } = await progress();
       if (started && !await ask(t('cal.new'), t('cal.sureNew', { time: time(started) }), t('cal.new'), t('cancel'), true)) return;
-    } catch { /* one that cannot be read is begun anew */ }
+    } catch (error) {
+      // One that cannot be read is begun anew; one that could not be asked for may be sound.
+      if (error.status !== 409) { notice(error.message, true); return; }
+    }
     await begin('all', true);
   };
   const buttons = [];
