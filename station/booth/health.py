@@ -155,10 +155,9 @@ def unusable(config: BoothConfig) -> str:
     """Words on a calibration that no scan can be taken with; empty if it is sound."""
     path = config.calibration
     try:
-        try:
-            calibrated = _calibrated(path, version_of(path))
-        except FileNotFoundError:
-            return CalibrationStore(config.calibrate.folder, path).missing_words()
+        if not path.exists():
+            return CalibrationStore.of(config).missing_words()
+        calibrated = _calibrated(path, version_of(path))
     except (BoothError, OSError) as error:
         return str(error)
     return mismatch(calibrated, configured_serials(config.cameras))

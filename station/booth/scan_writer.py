@@ -284,7 +284,7 @@ def booth_rig(config: BoothConfig) -> Rig:
     Raises:
         BoothError: it is not, or cannot be read.
     """
-    rig = CalibrationStore(config.calibrate.folder, config.calibration).rig_in_use()
+    rig = CalibrationStore.of(config).rig_in_use()
     if words := mismatch(calibrated_serials(rig.cameras), configured_serials(config.cameras)):
         raise CalibrationError(words)
     return rig

@@ -211,9 +211,7 @@ def run(config_path: Path | None) -> None:
         if not config.calibration.exists():
             from station.calibration.guide.store import CalibrationStore
 
-            click.echo(
-                CalibrationStore(config.calibrate.folder, config.calibration).missing_words()
-            )
+            click.echo(CalibrationStore.of(config).missing_words())
         table = services(config)
         longest = max((_socket_name(service.name) for service in table), key=len)
         supervise(table, path.resolve(), socket_folder(folder, longest), stop_event())

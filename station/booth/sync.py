@@ -66,7 +66,7 @@ class SyncProcess:
         self._checks = {name: FrameCheck(replays=name in config.recorded) for name in self._names}
         self._serials: dict[str, str] = {}
         self._live = LiveCloud(config.calibration, config.sync.live_hz)
-        drift = DriftWatch(CalibrationStore(config.calibrate.folder, config.calibration))
+        drift = DriftWatch(CalibrationStore.of(config))
         self._writer = ScanWriter(config, drift, log)
         self._order: Order | None = None
         """Started, but its frames are not being collected yet."""

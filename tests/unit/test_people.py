@@ -100,7 +100,7 @@ def config(tmp_path: Path) -> BoothConfig:
     path = tmp_path / "booth.toml"
     path.write_text(cameras)
     config = load_config(path)
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     Session.begin(store.unfinished, "2026", 0.1, RIG.cameras)
     store.finish(replace(RIG, created="2026-11-01T10:00:00Z"), {})
     store.use("20261101T100000Z")
@@ -138,7 +138,7 @@ def test_a_correction_is_a_dated_calibration_in_use(config: BoothConfig) -> None
         assert np.array_equal(
             rig.cameras[name].world_from_camera, RIG.cameras[name].world_from_camera
         )
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     assert len(store.entries()) == 2
     # What was said of the old calibration says nothing of the new one.
     assert problem_in_words(config) == []

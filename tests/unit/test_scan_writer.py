@@ -28,7 +28,7 @@ _HEADER = FrameHeader("front-lower", "V1", 640, 480, 1e-4, 7, 6e7, 5.0, 5.0, 1, 
 
 
 def test_frames_of_a_finished_scan_leave_the_memory(one_camera: BoothConfig) -> None:
-    store = CalibrationStore(one_camera.calibrate.folder, one_camera.calibration)
+    store = CalibrationStore.of(one_camera)
     writer = ScanWriter(one_camera, DriftWatch(store), logging.getLogger())
     try:
         depth = np.zeros((480, 640), np.uint16)
@@ -65,7 +65,7 @@ class _LongCheck(DriftWatch):
 
 
 def test_a_long_check_for_moved_cameras_is_no_slow_disk(one_camera: BoothConfig) -> None:
-    check = _LongCheck(CalibrationStore(one_camera.calibrate.folder, one_camera.calibration))
+    check = _LongCheck(CalibrationStore.of(one_camera))
     writer = ScanWriter(one_camera, check, logging.getLogger())
     try:
         depth = np.zeros((480, 640), np.uint16)

@@ -104,7 +104,7 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
         CalibrationError: cameras or sensors are not those of the calibration, or its picture of
             the empty booth lacks one.
     """
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     rig = store.rig_in_use()
     _refuse_others(rig, configured_serials(config.cameras))
     scene = store.scene()

@@ -62,7 +62,7 @@ def use_correction(config: BoothConfig, created: str) -> tuple[Drift, Entry]:
         CalibrationError: there is nothing to correct, or the correction does not hold for people
             whom it was not computed from.
     """
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     with store.locked():
         rig = store.rig_in_use()
         folder, cameras = config.spool.folder / FOLDER, set(rig.cameras)

@@ -69,7 +69,7 @@ def _called(
     from station.calibration.guide.store import CalibrationStore
 
     config = load_config(find_config(config_path))
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     attended = not yes and recordings is None
     guide = Guide(attended, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)

@@ -20,6 +20,7 @@ from typing import Any
 
 from station.calibration.detect.scene import StaticView
 from station.calibration.guide.session import SCENE, SESSION, Session
+from station.core.config import BoothConfig
 from station.core.drivers import CameraConfig
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import (
@@ -56,6 +57,11 @@ class CalibrationStore:
 
     folder: Path
     in_use: Path
+
+    @classmethod
+    def of(cls, config: BoothConfig) -> CalibrationStore:
+        """The store of a booth."""
+        return cls(config.calibrate.folder, config.calibration)
 
     def locked(self) -> AbstractContextManager[None]:
         """Hold the store alone: two that calibrate at once would write into one journal.

@@ -288,7 +288,7 @@ def _last_check(console: Console) -> Check | None:
 
 
 def _store(console: Console) -> CalibrationStore:
-    return CalibrationStore(console.config.calibrate.folder, console.config.calibration)
+    return CalibrationStore.of(console.config)
 
 
 def _known(console: Console, name: str) -> Entry:

@@ -89,7 +89,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
     """
     config = load_config(config_path)
     recordings = config.console.recordings
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     guide = PageGuide(recordings is None, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)
     alone = step not in ("all", "solve")
@@ -113,7 +113,7 @@ def unfinished(config: BoothConfig) -> tuple[str, list[str]]:
     Raises:
         FormatError: what it saw cannot be read.
     """
-    store = CalibrationStore(config.calibrate.folder, config.calibration)
+    store = CalibrationStore.of(config)
     procedure = Procedure(config, store, config.console.recordings, PageGuide(False, 0.0))
     session = procedure.unfinished_session(mend=False)
     return ("", []) if session is None else (session.started, procedure.finished(session))
