@@ -392,11 +392,11 @@ def test_a_recording_of_the_ball_is_looked_at_once(
     recording.mkdir(parents=True)
     (recording / INDEX).write_text("d-1.0-1-0.pgm\n")
     replayed = replace(begun, recordings=tmp_path / "recordings")
-    assert replayed._waved(session) is None
+    assert not replayed._waved(session)
     session.end_replay(fingerprint(tmp_path / "recordings" / BALL))
     assert replayed._waved(session)
     (recording / INDEX).write_text("d-2.0-2-0.pgm\n")
-    assert replayed._waved(session) is None
+    assert not replayed._waved(session)
 
 
 def test_a_ball_that_was_waved_enough_needs_no_recording(
@@ -405,4 +405,4 @@ def test_a_ball_that_was_waved_enough_needs_no_recording(
     begun, session, _ = guided
     monkeypatch.setattr(Coverage, "enough", True)
     (tmp_path / "recordings").mkdir()
-    assert replace(begun, recordings=tmp_path / "recordings")._waved(session) == ""
+    assert replace(begun, recordings=tmp_path / "recordings")._waved(session)

@@ -66,8 +66,8 @@ class Procedure(Attempt):
             self.empty()
         if "ball" not in done:
             self.ball()
-        elif session is not None and (words := self._waved(session)):
-            self.guide.say(words)
+        elif session is not None:
+            self._say_what_would_help(session)
         if "mark" not in done:
             self.rest(MARK)
         recorded_front = self.recordings is not None and (self.recordings / FRONT).is_dir()
@@ -86,7 +86,7 @@ class Procedure(Attempt):
             return []
         done = {
             "floor": session.done(EMPTY),
-            "ball": self._waved(session) is not None,
+            "ball": self._waved(session),
             "mark": session.done(MARK),
             "around": session.around_count >= len(_AROUND),
             "stand": session.raised_enough,
@@ -94,24 +94,23 @@ class Procedure(Attempt):
         }
         return [step for step, is_done in done.items() if is_done]
 
-    def _waved(self, session: Session) -> str | None:
-        """Words on a ball that was waved enough (none), or as long as is asked for or recorded:
-        then a camera may lack something that more of it would not show. None: it was not."""
+    def _waved(self, session: Session) -> bool:
+        """Whether the ball was waved enough, or as long as is asked for or recorded: then a camera
+        may lack something that more of it would not show."""
+        if coverage_so_far(session, self.config.reference).enough:
+            return True
+        if self.recordings is None:
+            return session.waved_s >= self.config.calibrate.waving_s
+        folder = self.recordings / BALL
+        return folder.is_dir() and session.replayed == fingerprint(folder)
+
+    def _say_what_would_help(self, session: Session) -> None:
         coverage = coverage_so_far(session, self.config.reference)
-        if coverage.enough:
-            return ""
-        over = (
-            session.waved_s >= self.config.calibrate.waving_s
-            if self.recordings is None
-            else (self.recordings / BALL).is_dir()
-            and session.replayed == fingerprint(step_folder(self.recordings, BALL))
-        )
-        return (
-            f"the ball was waved for {session.waved_s} s; more of it would help (station "
-            f"calibrate ball): {coverage.advice()}"
-            if over
-            else None
-        )
+        if not coverage.enough:
+            self.guide.say(
+                f"the ball was waved for {session.waved_s} s; more of it would help (station "
+                f"calibrate ball): {coverage.advice()}"
+            )
 
     def _check_recordings(self) -> None:
         """Recorded steps are of all cameras: one that is missing is not found out minutes later."""
