@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import logging
-import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -16,16 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from sync_process import sync_of
 
-from station.booth import control as control_module
-from station.booth.collection import Order
-from station.booth.control import ControlProcess
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
 from station.booth.operator import asking, status_cli
 from station.booth.scan_writer import booth_rig
-from station.booth.sync import SyncProcess
 from station.calibration.drift.check_cli import check
 from station.calibration.guide.calibrate_cli import calibrate
 from station.core.config import BoothConfig
@@ -33,10 +27,10 @@ from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
 from station.core.rig import Rig
-from station.core.scans import CANCELLED, ScanNote, boot_id, scan_id_of
+from station.core.scans import CANCELLED, scan_id_of
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.core.spool import Spool
-from station.messaging.messages import Reply, Request
+from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
 from station.sensors.identity import calibrated_serials
 from station.simulation.scene import default_rig
@@ -204,17 +198,13 @@ def test_framesets_that_are_too_rare_for_a_scan_are_told(
     config: BoothConfig, sets: int, apart_s: float, quiet_s: float, flows_s: float, *, told: bool
 ) -> None:
     """Scans failed for it, and status said that all was well."""
-    sync = SyncProcess(config, logging.getLogger("sync"))
-    try:
+    with sync_of(config) as sync:
         sync._silent_s = 100.0 - quiet_s
         sync._intake.last_frame_s.update(dict.fromkeys(_CAMERAS, time.monotonic() + flows_s))
         sync._set_times_s.extend(100.0 - apart_s * np.arange(sets)[::-1])
         words = sync._too_slow(100.0)
         assert bool(words) == told
         assert not told or "pictures of a scan came within 3 s: this computer is too busy" in words
-    finally:
-        sync._writer.close()
-        sync._context.destroy(linger=0)
 
 
 def test_status_tells_by_its_exit_code_whether_scans_can_be_taken(
@@ -421,85 +411,8 @@ def test_status_shows_framesets_per_second(
 
     assert "framesets: 30 per second\n" in shown(streaming=True)
     assert "framesets" not in shown(streaming=False)
-    sync = SyncProcess(config, logging.getLogger("sync"))
-    try:
+    with sync_of(config) as sync:
         assert sync._health()["framesets_hz"] == 0.0
-    finally:
-        sync._writer.close()
-        sync._context.destroy(linger=0)
-
-
-def test_a_scan_that_is_being_stored_is_told_as_such_when_it_is_cancelled(
-    config: BoothConfig,
-) -> None:
-    """It was said not to be taken, while status had it."""
-    sync = SyncProcess(config, logging.getLogger("sync"))
-    try:
-        scan_id = scan_id_of("one")
-        sync._writing[scan_id] = Order(scan_id, "", math.inf)
-        reply = sync._cancel(scan_id)
-        assert (reply.ok, reply.error) == (
-            False,
-            "scan one is being stored: it is too late to cancel",
-        )
-    finally:
-        sync._writer.close()
-        sync._context.destroy(linger=0)
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_a_cancel_that_overtakes_its_order_cancels_it(config: BoothConfig, late: bool) -> None:
-    """While sync restarted, the operator was told that the scan was not being taken; then it was
-    taken, or said to have failed because its order came late."""
-    later_s = time.monotonic() + 60.0
-    comes_s = 1.0 if late else later_s
-    notes = Spool(config.spool.folder).notes
-    sync = SyncProcess(config, logging.getLogger("sync"))
-    try:
-        scan_id = scan_id_of("one")
-        notes.write(
-            ScanNote(scan_id, "armed", valid_until_s=later_s, boot=boot_id()), durable=False
-        )
-        assert not sync._reply(Request("cancel", scan_id)).ok
-        assert sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
-        assert sync._reply(Request("scan", scan_id, valid_until_s=comes_s)).ok
-        while (note := notes.read(scan_id)) is None or note.stage == "armed":
-            time.sleep(0.05)
-        assert (note.stage, note.reason) == ("failed", CANCELLED)
-        for event in sync._writer.events():
-            sync._handle(event)
-        # It has ended: no order of it comes.
-        assert not sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
-        assert sync._cancelled == set()
-    finally:
-        sync._writer.close()
-        sync._context.destroy(linger=0)
-
-
-def test_a_disk_that_cannot_be_read_is_not_in_the_way_of_a_cancel(
-    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Sync, which has the scan, was not asked."""
-
-    def torn(*_: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    asked: list[Request] = []
-
-    def sync_answers(_: Path, __: str, request: Request, ___: float) -> Reply:
-        asked.append(request)
-        return Reply(ok=True)
-
-    path = config.calibration.parent / "booth.toml"
-    control = ControlProcess(config, path, logging.getLogger("control"))
-    monkeypatch.setattr(control_module, "ask", sync_answers)
-    monkeypatch.setattr(control._spool.notes, "read", torn)
-    try:
-        reply = control._reply(Request("cancel", "one"))
-    finally:
-        control._context.destroy(linger=0)
-    assert (reply.ok, reply.content["reason"]) == (True, CANCELLED)
-    assert [(request.command, request.scan_id) for request in asked] == [("cancel", "one")]
 
 
 def test_framesets_before_a_pause_do_not_count() -> None:
