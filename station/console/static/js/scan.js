@@ -14,7 +14,7 @@ const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
 
 // What the view told when it was left, in which language: it is told on in another one.
-let left = null;
+let kept = null;
 
 export async function scan(main, session) {
   const state = await get('/booth');
@@ -239,13 +239,14 @@ export async function scan(main, session) {
   showTroubles(state);
   const looking = setInterval(look, TROUBLES_MS);
   const language = currentLanguage();
-  if (left && left.language !== language) ({ label, pressed, took } = left);
+  const told = kept?.language === language ? null : kept;
+  kept = null;
+  if (told) ({ label, pressed, took } = told);
   ready();
-  if (left && left.language !== language && left.current) follow(left.current);
-  left = null;
+  if (told?.current) follow(told.current);
   latest();
   return () => {
-    left = { language, label, pressed, took, current };
+    kept = { language, label, pressed, took, current };
     clearInterval(timer);
     clearInterval(looking);
     silence();
