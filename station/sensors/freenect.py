@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
-from station.core.kinect_v1 import FRAME_RATE_HZ, HEIGHT, TABLE, WIDTH
+from station.core.kinect_v1 import FRAME_RATE_HZ, HEIGHT, WIDTH, depth_of_raw
 from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.recorded import kinect_v1
 from station.sensors.recording import check_recording
@@ -228,7 +228,7 @@ class FreenectDriver:
                 raise DriverError(f"{self._name} sends no frames; reopening it") from None
             return None
         self._last_s = arrived.received_s
-        depth = TABLE[arrived.raw.reshape(HEIGHT, WIDTH) & 2047]
+        depth = depth_of_raw(arrived.raw.reshape(HEIGHT, WIDTH))
         return DepthFrame(depth, arrived.ticks, arrived.received_s, arrived.sequence)
 
     def _play_again(self) -> None:

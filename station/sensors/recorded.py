@@ -13,10 +13,10 @@ from station.core.errors import DriverError, FormatError
 from station.core.kinect_v1 import (
     DEPTH_SCALE_M,
     HEIGHT,
-    TABLE,
     TICK_BITS,
     TICK_HZ,
     WIDTH,
+    depth_of_raw,
     nominal_intrinsics,
 )
 from station.sensors.base import DepthFrame, DeviceInfo
@@ -79,7 +79,7 @@ class RecordedDriver:
         if wait_s > timeout_s:
             return None
         try:
-            depth = TABLE[read_raw(path) & 2047]
+            depth = depth_of_raw(read_raw(path))
         except (OSError, ValueError, FormatError) as cause:
             raise DriverError(f"{path} cannot be read ({cause}); record again") from None
         frame = DepthFrame(depth, ticks, time.monotonic(), self._sequence)

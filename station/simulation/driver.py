@@ -10,7 +10,7 @@ from pydantic import Field
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError
-from station.core.kinect_v1 import DEPTH_SCALE_M, FRAME_RATE_HZ, TABLE, TICK_BITS, TICK_HZ
+from station.core.kinect_v1 import DEPTH_SCALE_M, FRAME_RATE_HZ, TICK_BITS, TICK_HZ, depth_of_raw
 from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.recorded import RecordedCamera
 
@@ -78,7 +78,7 @@ class VirtualDriver:
         time.sleep(max(wait_s, 0.0))
         frame = self._loop[self._sequence % len(self._loop)]
         ticks = self._unit.ticks(self._unit.phase_s + due_s)
-        result = DepthFrame(TABLE[frame.raw], ticks, time.monotonic(), self._sequence)
+        result = DepthFrame(depth_of_raw(frame.raw), ticks, time.monotonic(), self._sequence)
         self._sequence += 1
         return result
 

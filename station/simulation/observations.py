@@ -22,7 +22,7 @@ from station.calibration.detect.step_names import (
     kind_of,
 )
 from station.calibration.detect.swing import LOOK_S, whole_swings
-from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
+from station.core.kinect_v1 import DEPTH_SCALE_M, depth_of_raw
 from station.core.rig import CameraCalibration
 from station.sensors.clock import DeviceClock
 from station.simulation.procedure import STRIDE, VirtualProcedure
@@ -47,7 +47,7 @@ def simulate(procedure: VirtualProcedure, camera: CameraCalibration) -> Observat
         for frame in procedure.frames(name, step, stride=every, limit_s=limit_s):
             delay_s = _TRANSPORT_S[0] + rng.exponential(_TRANSPORT_S[1])
             time_s = clock.host_time_s(frame.ticks, frame.time_s + delay_s)
-            yield time_s, TABLE[frame.raw]
+            yield time_s, depth_of_raw(frame.raw)
 
     def still(step: str, limit_s: float | None) -> _Depth:
         return np.stack([depth for _, depth in timed(step, limit_s, 1)])

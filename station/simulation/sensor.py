@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.errors import InputError
 from station.core.geometry import se3_exp
-from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
+from station.core.kinect_v1 import DEPTH_SCALE_M, depth_of_raw
 from station.core.rig import CameraCalibration, Rig
 from station.sensors.recording import RecordedFrame
 from station.simulation import violations
@@ -195,7 +195,9 @@ def render_bundle(
     for name in booth.rig.cameras:
         camera = VirtualCamera(booth, name, body)
         taken[name] = [
-            CapturedFrame(TABLE[frame.raw], frame.ticks, TICK_HZ, frame.time_s, frame.sequence)
+            CapturedFrame(
+                depth_of_raw(frame.raw), frame.ticks, TICK_HZ, frame.time_s, frame.sequence
+            )
             for frame in camera.frames(0 if name in booth.dead_cameras else frames)
         ]
     write_bundle(

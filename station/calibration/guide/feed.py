@@ -25,7 +25,7 @@ from station.calibration.detect.detections import uncalibrated
 from station.calibration.guide.recorded_clock import RecordedClock
 from station.core.config import BoothConfig
 from station.core.errors import CalibrationError
-from station.core.kinect_v1 import NO_READING, TABLE
+from station.core.kinect_v1 import depth_of_raw
 from station.core.rig import CameraCalibration
 from station.core.service import die_with_parent
 from station.messaging.intake import FrameIntake, LiveFrame
@@ -61,7 +61,7 @@ class TimedFrame:
         """``depth``, from its file where it is not held."""
         if self.depth.size or self.file is None:
             return self.depth
-        return TABLE[read_raw(self.file) & NO_READING]
+        return depth_of_raw(read_raw(self.file))
 
     def depth_m(self) -> NDArray[np.float32]:
         return self.pixels().astype(np.float32) * np.float32(self.scale_m)

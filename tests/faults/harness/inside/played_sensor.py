@@ -15,7 +15,7 @@ from pydantic import Field
 
 from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError
-from station.core.kinect_v1 import FRAME_RATE_HZ, TABLE, TICK_BITS, TICK_HZ
+from station.core.kinect_v1 import FRAME_RATE_HZ, TICK_BITS, TICK_HZ, depth_of_raw
 from station.sensors.base import DepthFrame, DeviceInfo
 from station.sensors.recorded import kinect_v1
 from station.sensors.recording import check_recording, read_raw
@@ -54,7 +54,7 @@ class PlayedDriver:
             raise DriverError(f"camera {self._camera.name} is not connected; check its cable")
         if not self._pictures:
             frames = check_recording(self._camera.recording)
-            self._pictures = [TABLE[read_raw(path) & 2047] for _, _, path in frames]
+            self._pictures = [depth_of_raw(read_raw(path)) for _, _, path in frames]
         self._start_s, self._frame, self._sequence = time.monotonic(), 0, 0
         self._base = (0.0, _SPAN - _WRAPS_AFTER_S * TICK_HZ)
         return kinect_v1(self._value if self._fault == "swapped" else self._camera.serial)
