@@ -15,8 +15,11 @@ from station.core.config_file import load_config
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 
-_OF_BODIES = [f"tests/accuracy/test_{name}.py" for name in ("bars", "model_accuracy", "unlike")]
-"""Files that share the database of bodies: half a minute to make."""
+_TOGETHER = (
+    [f"tests/accuracy/test_{name}.py" for name in ("bars", "model_accuracy", "unlike")],
+    [f"tests/console/test_{name}.py" for name in ("api", "attacks", "exports", "page", "security")],
+)
+"""Files that share what takes half a minute to make: the database of bodies; a station's scans."""
 
 _ONE_CAMERA = """
 [[cameras]]
@@ -29,11 +32,11 @@ folder = "spool"
 
 
 class _Files(LoadFileScheduling):  # type: ignore[misc]  # xdist states no types
-    """A process takes whole files, and those of bodies together."""
+    """A process takes whole files, and those that share much together."""
 
     def _split_scope(self, nodeid: str) -> str:
         path = super()._split_scope(nodeid)
-        return _OF_BODIES[0] if path in _OF_BODIES else path
+        return next((files[0] for files in _TOGETHER if path in files), path)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -13,19 +13,24 @@ from live_console import LiveConsole
 
 @pytest.fixture(scope="package")
 def console(booth: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
-    """A station with a console, running, sensors on."""
+    """A station with a console, running, sensors off."""
     live = LiveConsole(booth, tmp_path_factory.mktemp("console"))
-    try:
-        live.start_sensors()
-        yield live
-    finally:
-        live.close()
+    yield live
+    live.close()
+
+
+@pytest.fixture(scope="module")
+def sensors(console: LiveConsole) -> Iterator[None]:
+    """The console's sensors run."""
+    with console.sensors():
+        yield
 
 
 @pytest.fixture(scope="package")
 def scans(console: LiveConsole) -> list[dict[str, Any]]:
     """Two delivered scans of the console's station."""
-    found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
+    with console.sensors():
+        found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
     assert all(scan["state"] in ("delivered", "rescan") for scan in found), found
     return found
 

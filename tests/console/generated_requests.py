@@ -23,6 +23,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
+pytestmark = pytest.mark.usefixtures("sensors")
+
 CASES = int(os.environ.get("CONSOLE_CASES", "6"))
 _CHECKS = [
     not_a_server_error, status_code_conformance, content_type_conformance,

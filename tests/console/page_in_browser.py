@@ -29,6 +29,8 @@ from console_page import (
 from live_console import API, LiveConsole
 from playwright.sync_api import BrowserContext, Page, Route, expect
 
+pytestmark = pytest.mark.usefixtures("sensors")
+
 AXE = Path(__file__).parent / "node_modules/axe-core/axe.min.js"
 _NOTE_REMEDY = """() => {
   const shown = document.querySelector('[data-camera=back-upper] .remedy');

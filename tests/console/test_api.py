@@ -97,7 +97,7 @@ def test_the_pages_files_are_packed_and_tagged(console: LiveConsole) -> None:
 
 
 def test_the_same_key_never_scans_twice(console: LiveConsole, scans: list[dict[str, Any]]) -> None:
-    with console.client("scan") as client:
+    with console.sensors(), console.client("scan") as client:
         first = client.post(
             "/scans", json={"label": "twice"}, headers={"Idempotency-Key": "k-1"}
         ).json()
@@ -130,7 +130,7 @@ def test_a_target_that_is_no_longer_configured_waits_for_nothing(console: LiveCo
 
 
 def test_a_countdown_can_be_cancelled(console: LiveConsole) -> None:
-    with console.client("scan") as client:
+    with console.sensors(), console.client("scan") as client:
         scan = client.post("/scans", json={"label": "gone", "countdown_s": 20}).json()
         assert scan["state"] == "countdown"
         assert not scan["may_leave"]
@@ -247,7 +247,9 @@ def test_a_killed_camera_is_told_with_its_remedy(console: LiveConsole) -> None:
             console.station.wait_until(dead, "the stopped camera is told", 20.0)
     finally:
         os.kill(console.station.pids("capture", "back-upper")[0], signal.SIGCONT)
-    console.start_sensors()
+    # Later tests want it back.
+    with console.sensors():
+        pass
 
 
 def test_the_openapi_document_is_there_without_a_login(console: LiveConsole) -> None:
@@ -273,13 +275,14 @@ def test_the_readme_client_works(console: LiveConsole, tmp_path: Path) -> None:
     assert len(program[1].splitlines()) <= 40
     path = tmp_path / "client.py"
     path.write_text(program[1])
-    done, refused = (
-        subprocess.run(
-            [sys.executable, str(path), console.url, console.tokens[scope], "Order 99"],
-            capture_output=True, text=True, timeout=120, check=False,
-        )
-        for scope in ("scan", "read")
-    )  # fmt: skip
+    with console.sensors():
+        done, refused = (
+            subprocess.run(
+                [sys.executable, str(path), console.url, console.tokens[scope], "Order 99"],
+                capture_output=True, text=True, timeout=120, check=False,
+            )
+            for scope in ("scan", "read")
+        )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "waist_girth" in done.stdout
     # A refusal was a traceback with "409 Conflict", and its reason was not read.

@@ -72,7 +72,7 @@ def test_guesses_that_are_sent_all_at_once_count_one_by_one(console: LiveConsole
 
 
 def test_the_same_key_at_the_same_time_is_one_scan(console: LiveConsole) -> None:
-    with console.client("scan") as client:
+    with console.sensors(), console.client("scan") as client:
 
         def take(_: int) -> str:
             answer = client.post(
@@ -106,14 +106,13 @@ def test_a_key_whose_scan_was_deleted_begins_no_other(console: LiveConsole) -> N
 def test_a_refused_request_may_be_sent_again(console: LiveConsole) -> None:
     request = {"json": {"label": "again", "countdown_s": 20}, "headers": {"Idempotency-Key": "off"}}
     with console.client() as client:
-        client.post("/booth/stop").raise_for_status()
         refused = client.post("/scans", **request)  # type: ignore[arg-type]
         assert refused.status_code == 409
         assert "sensors are stopped" in refused.json()["detail"]
-        console.start_sensors()
-        taken = client.post("/scans", **request)  # type: ignore[arg-type]
-        assert taken.status_code == 202
-        client.post(f"/scans/{taken.json()['scan_id']}/cancel").raise_for_status()
+        with console.sensors():
+            taken = client.post("/scans", **request)  # type: ignore[arg-type]
+            assert taken.status_code == 202
+            client.post(f"/scans/{taken.json()['scan_id']}/cancel").raise_for_status()
 
 
 @pytest.mark.parametrize("junk", ["x", "-1", "0-0", "9" * 60, "²-²", "00000000-", "a-1; b"])

@@ -11,6 +11,7 @@ import signal
 import time
 from typing import Any
 
+import pytest
 from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
 from live_console import LiveConsole
 from playwright.sync_api import expect
@@ -19,6 +20,8 @@ from station.calibration.guide.session import Session
 from station.calibration.guide.store import UNFINISHED
 from station.core.rig import Rig
 from station.handover.ledger import Ledger, Waiting
+
+pytestmark = pytest.mark.usefixtures("sensors")
 
 _NOTE_WORDS = """() => {
   window.told = [];
