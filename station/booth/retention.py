@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -183,13 +184,52 @@ def _names(name: str, scan_id: ScanId) -> bool:
     return plain == scan_id or plain.startswith(f"{scan_id}.")
 
 
-def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
-    """Delete a scan: its bundle, its results, its note and its name. Returns what was removed.
+@dataclass(slots=True)
+class Removed:
+    """Files that were deleted, also where the disk refused to delete the rest."""
+
+    paths: list[Path] = field(default_factory=list)
+    receivers: set[str] = field(default_factory=set)
+    """Targets that have copies, which stay there."""
+
+
+def purge_scans(spool: Spool, scan_ids: Sequence[str], removed: Removed) -> None:
+    """Delete scans: their bundles, results, notes and names; all of them or, if one is refused,
+    none. What is deleted is added to ``removed``.
 
     Raises:
-        InputError: it is not a valid scan id.
-        SpoolError: there is no such scan, or it is being taken or reconstructed.
+        InputError: one is not a valid scan id.
+        SpoolError: one does not exist, or is being taken or reconstructed.
     """
+    # Not all locks at once: a label may have more scans than a process may open files.
+    for scan_id in scan_ids:
+        with _removable(spool, scan_id):
+            pass
+    for scan_id in scan_ids:
+        with _removable(spool, scan_id) as paths:
+            _purge(spool, scan_id, paths, removed)
+    # Whoever removes old scans just now forgets these, too.
+    with suppress(SpoolError), held(spool.folder / _LOCK, _BUSY):
+        _save(spool, _load(spool))
+
+
+def _purge(spool: Spool, scan_id: str, paths: list[Path], removed: Removed) -> None:
+    ledger = Ledger(spool.folder)
+    receivers = ledger.receivers(scan_id)
+    for path in paths:
+        if path.parent.name in STATES:
+            spool.remove(path)
+        else:
+            delete(path)
+        removed.paths.append(path)
+    # Nothing else knows of the copies from now on.
+    removed.receivers.update(receivers)
+    ledger.forget(scan_id)
+
+
+@contextmanager
+def _removable(spool: Spool, scan_id: str) -> Iterator[list[Path]]:
+    """Everything that is kept of a scan, while no other process may change it."""
     name = scan_id_of(scan_id)
     lock = spool.lock(name)
     try:
@@ -203,19 +243,10 @@ def purge_scan(spool: Spool, scan_id: str) -> list[Path]:
         found = [path for path in traces(spool, name) if path.parent.name != "locks"]
         if not found:
             raise SpoolError(f"there is no scan {name} in {spool.folder}")
-        for path in found:
-            if path.parent.name in STATES:
-                spool.remove(path)
-            else:
-                delete(path)
-        Ledger(spool.folder).forget(name)
-        # Whoever removes old scans just now forgets this one, too.
-        with suppress(SpoolError), held(spool.folder / _LOCK, _BUSY):
-            _save(spool, _load(spool))
+        yield found
     finally:
         if lock is not None:
             spool.unlock(name, lock)
-    return found
 
 
 @click.command()
@@ -237,23 +268,19 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         raise click.UsageError("give a scan id, --label or --old")
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
-    removed, receivers = list[Path](), set[str]()
+    removed = Removed()
     try:
         if old:
-            removed = expire_old(spool, config.retention)
+            removed.paths = expire_old(spool, config.retention)
         else:
-            scans = [scan_id_of(scan_id)] if scan_id else _labelled(spool, str(label))
-            for scan in scans:
-                copied_to = Ledger(spool.folder).receivers(scan)
-                removed += purge_scan(spool, scan)
-                receivers.update(copied_to)
+            scans = [scan_id] if scan_id else _labelled(spool, str(label))
+            purge_scans(spool, scans, removed)
     finally:
-        # Also where a later scan cannot be deleted: nothing else knows of the copies any more.
-        for folder in removed:
-            click.echo(f"removed {folder}")
-        if receivers:
-            click.echo(f"copies handed over to {', '.join(sorted(receivers))} stay there")
-    if old and not removed:
+        for path in removed.paths:
+            click.echo(f"removed {path}")
+        if removed.receivers:
+            click.echo(f"copies handed over to {', '.join(sorted(removed.receivers))} stay there")
+    if old and not removed.paths:
         click.echo("nothing is past its retention period")
     # Labels leave the index together with the scans, not at the next query.
     ScanIndex(spool).find(limit=0)

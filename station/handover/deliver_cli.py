@@ -16,6 +16,7 @@ from station.core.commands import config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError, SpoolError
+from station.core.scans import ScanId
 from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
@@ -93,9 +94,10 @@ class HandOver:
     def look(self) -> None:
         """Record new results in the outbox."""
         found = self._index.find(states=["delivered", "rescan"], limit=_RESULTS)
+        noted = self._spool.notes.ids()
         for section in self._config.deliver:
             wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
-            self._ledger.follow(section.name, wanted)
+            self._ledger.follow(section.name, wanted, noted)
 
     def _serve(self, name: str, stop: threading.Event) -> None:
         while not stop.wait(_POLL_S):
@@ -111,9 +113,14 @@ class HandOver:
             if entry.target == name and entry.due(now_s):
                 self._round_s[name] = time.monotonic()
                 self._try(entry, now_s)
-                if not self._spool.path("outbox", entry.scan_id).exists():
+                if not self._is_known(ScanId(entry.scan_id)):
                     # Deleted during the try, whose end was recorded after that.
                     self._ledger.forget(entry.scan_id)
+
+    def _is_known(self, scan_id: ScanId) -> bool:
+        """Whether a scan still has a result, or a note because its result was taken away."""
+        places = self._spool.path("outbox", scan_id), self._spool.notes.path(scan_id)
+        return any(place.exists() for place in places)
 
     def _try(self, entry: Waiting, now_s: float) -> None:
         scan: ScanRecord | None = self._index.get(entry.scan_id)

@@ -1,7 +1,7 @@
 """Record of hand-overs, kept on disk so that it survives a restart.
 
 handover/<target>/waiting/<scan id>.json   tries, when next, what went wrong
-handover/<target>/done/<scan id>           handed over; kept as long as the result is
+handover/<target>/done/<scan id>           handed over; kept as long as the result or its note is
 """
 
 from __future__ import annotations
@@ -51,12 +51,20 @@ class Ledger:
     def __init__(self, spool_folder: Path) -> None:
         self._folder = spool_folder / "handover"
 
-    def follow(self, target: str, scan_ids: Iterable[str]) -> None:
-        """Add new results; remove those that no longer exist."""
+    def follow(self, target: str, scan_ids: Iterable[str], noted: Iterable[str]) -> None:
+        """Add new results; remove what waits of those that no longer exist.
+
+        ``noted``: scans that are known although their results may have been taken away. Who has
+        copies of these is told when they are deleted.
+        """
         there = set(scan_ids)
+        known = there.union(noted)
         done, waiting = self._place(target, "done"), self._place(target, "waiting")
-        for path in [*done.iterdir(), *waiting.glob("*.json")]:
-            if path.name.removesuffix(".json") not in there:
+        for path in done.iterdir():
+            if path.name not in known:
+                path.unlink(missing_ok=True)
+        for path in waiting.glob("*.json"):
+            if path.stem not in there:
                 path.unlink(missing_ok=True)
         for scan_id in there:
             if not (done / scan_id).exists() and not (waiting / f"{scan_id}.json").exists():

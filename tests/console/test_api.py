@@ -149,7 +149,8 @@ def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) ->
         ledger = Ledger(console.config.spool.folder)
         ledger.finish(Waiting("shop", done["scan_id"]))
         assert client.get(f"/scans/{done['scan_id']}").json()["handed_over"] == ["shop"]
-        assert client.delete(f"/scans/{done['scan_id']}").json() == {"scans": [done["scan_id"]]}
+        told = client.delete(f"/scans/{done['scan_id']}").json()
+        assert told == {"scans": [done["scan_id"]], "handed_over": ["shop"]}
         assert ledger.receivers(done["scan_id"]) == []
         _problem(client.get(f"/scans/{done['scan_id']}"), 404, "no-such-scan")
         _problem(client.delete("/scans", params={"label": "nobody"}), 404, "no-such-scan")

@@ -1,5 +1,6 @@
 """Scans are found by label and time, from the folders alone."""
 
+import errno
 import json
 import os
 import re
@@ -361,8 +362,8 @@ def test_copies_that_were_handed_over_are_told_by_purge(spool: Spool) -> None:
     assert "copies handed" not in CliRunner().invoke(purge, [other, *option]).output
 
 
-def test_copies_are_told_where_another_scan_of_the_label_cannot_be_deleted(spool: Spool) -> None:
-    """Its refusal was all that was told, and whom the first one was handed over to was lost."""
+def test_scans_of_a_label_are_deleted_all_or_none(spool: Spool) -> None:
+    """Half of them were gone when one that was being reconstructed was refused."""
     option, ledger = _booth(spool), Ledger(spool.folder)
     first, second = "20261121T100000Z-0001", ScanId("20261126T100000Z-0006")
     spool.path("outbox", second).mkdir()
@@ -376,9 +377,38 @@ def test_copies_are_told_where_another_scan_of_the_label_cannot_be_deleted(spool
     done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
     spool.unlock(second, lock)
     assert "is being reconstructed" in str(done.exception)
-    assert f"removed {spool.path('outbox', first)}\n" in done.output
-    assert done.output.endswith("copies handed over to to-1 stay there\n")
-    assert ledger.receivers(second) == ["to-6"]
+    assert done.output == ""
+    assert spool.path("outbox", first).exists()
+    assert (ledger.receivers(first), ledger.receivers(second)) == (["to-1"], ["to-6"])
+    done = CliRunner().invoke(purge, ["--label", "Order 1234", *option])
+    assert done.output.endswith("copies handed over to to-1, to-6 stay there\n")
+
+
+def test_copies_are_told_where_the_disk_refuses_to_delete_the_rest(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing else knows of them any more."""
+    option, ledger = _booth(spool), Ledger(spool.folder)
+    first, second = ScanId("20260101T000000Z-0001"), ScanId("20260101T000000Z-0002")
+    for name in (first, second):
+        spool.path("outbox", name).mkdir()
+        write_json(spool.path("outbox", name) / "result.json", {"label": "7", "status": "ok"})
+        ledger.finish(Waiting(f"to-{name[-1]}", name))
+    remove, kept = Spool.remove, set[str]()
+
+    def refused(self: Spool, path: Path) -> None:
+        if kept and path.name not in kept:
+            raise OSError(errno.EIO, "it is broken")
+        kept.add(path.name)
+        remove(self, path)
+
+    monkeypatch.setattr(Spool, "remove", refused)
+    done = CliRunner().invoke(purge, ["--label", "7", *option])
+    [gone] = kept
+    assert done.output.startswith(f"removed {spool.path('outbox', ScanId(gone))}\n")
+    assert done.output.endswith(f"copies handed over to to-{gone[-1]} stay there\n")
+    [left] = {first, second} - kept
+    assert ledger.receivers(left) == [f"to-{left[-1]}"]
 
 
 def test_what_is_removed_of_a_scan_that_was_never_stored_is_told(spool: Spool) -> None:

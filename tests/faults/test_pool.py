@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from station.booth.retention import FILE, Moment, expire_old, purge_scan
+from station.booth.retention import FILE, Moment, Removed, expire_old, purge_scans
 from station.core.config import RetentionConfig
 from station.core.errors import SpoolError
 from station.core.files import held
@@ -146,7 +146,7 @@ def test_nothing_of_a_purged_scan_stays(spool: Spool) -> None:
     (spool.folder / "tmp" / f"{scan_id}5.99.1").mkdir()
     spool.notes.write(ScanNote(scan_id, "delivered", label="Order 1"), durable=True)
     expire_old(spool, RetentionConfig())
-    purge_scan(spool, scan_id)
+    purge_scans(spool, [scan_id], Removed())
     left = [path for path in spool.folder.rglob("*") if scan_id in path.name]
     assert [path.name for path in left] == [f"{scan_id}5.99.1"]
     assert scan_id not in (spool.folder / FILE).read_text()
@@ -156,7 +156,9 @@ def test_a_scan_is_purged_while_old_ones_are_removed(spool: Spool) -> None:
     """It was, and the command ended with an error that promised to retry."""
     spool.path("outbox", "a").mkdir()
     with held(spool.folder / "retention.lock", SpoolError("busy")):
-        assert purge_scan(spool, "a") == [spool.path("outbox", "a")]
+        removed = Removed()
+        purge_scans(spool, ["a"], removed)
+        assert removed.paths == [spool.path("outbox", "a")]
 
 
 def test_a_file_among_what_dead_writers_left_is_removed(spool: Spool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -12,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from station.archive.records import ScanRecord
-from station.booth.retention import purge_scan
+from station.booth.retention import Removed, purge_scans
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
+from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver
 from station.handover.ledger import Ledger, Waiting
@@ -96,7 +98,7 @@ def test_a_scan_that_is_deleted_while_it_is_handed_over_waits_for_nobody(tmp_pat
     handover = HandOver(load_config(config), logging.getLogger("deliver"))
 
     def deleted(scan: ScanRecord, result: Path) -> None:
-        purge_scan(spool, result.name)
+        purge_scans(spool, [result.name], Removed())
         if scan.scan_id == _IDS[0]:
             raise HandOverError("it is gone")
 
@@ -106,6 +108,27 @@ def test_a_scan_that_is_deleted_while_it_is_handed_over_waits_for_nobody(tmp_pat
     ledger = Ledger(spool.folder)
     assert ledger.waiting() == []
     assert [ledger.receivers(name) for name in _IDS] == [[], []]
+
+
+def test_who_has_copies_is_known_after_a_result_was_taken_away(tmp_path: Path) -> None:
+    """Deleting the scan named nobody then."""
+    config = tmp_path / "booth.toml"
+    config.write_text(f'{_CAMERA}[[deliver]]\nname = "share"\nfolder = "share"\n')
+    (tmp_path / "share").mkdir()
+    spool, scan_id = Spool(tmp_path / "spool"), ScanId(_IDS[0])
+    for name in _IDS:
+        _result(spool.folder / "outbox" / name, measurements=[])
+    spool.notes.write(ScanNote(scan_id, "delivered"), durable=False)
+    handover = HandOver(load_config(config), logging.getLogger("deliver"))
+    handover.look()
+    handover.try_all("share", 1e9)
+    for name in _IDS:
+        shutil.rmtree(spool.folder / "outbox" / name)
+    handover.look()
+    assert [Ledger(spool.folder).receivers(name) for name in _IDS] == [["share"], []]
+    removed = Removed()
+    purge_scans(spool, [scan_id], removed)
+    assert removed.receivers == {"share"}
 
 
 def test_the_name_of_a_deleted_folder_is_no_pattern(tmp_path: Path) -> None:

@@ -136,6 +136,7 @@ class Removed(BaseModel):
     """The scans that were deleted."""
 
     scans: list[str]
+    handed_over: list[str] = Field(description="targets that have copies, which stay there")
 
 
 class File(BaseModel):

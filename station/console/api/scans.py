@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query
 
 from station.archive.records import ScanRecord, ScanState, read_noted
-from station.booth.retention import purge_scan
+from station.booth import retention
 from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import (
     Booth,
+    Caller,
     Console,
     IdempotencyKey,
     Manager,
@@ -144,9 +145,7 @@ def cancel(scan_id: ScanId, console: Booth, caller: Scanner) -> Scan:
 def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
     """Delete a scan, its bundle and its results permanently."""
     console.record(scan_id)
-    console.audit.note(caller.name, caller.address, "delete", scan_id)
-    purge_scan(console.spool, scan_id)
-    return Removed(scans=[scan_id])
+    return _delete(console, caller, [scan_id])
 
 
 @router.delete("", responses=responses(404, 409))
@@ -161,10 +160,15 @@ def delete_label(
     found = console.index.ids_of(label)
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
-    for scan_id in found:
+    return _delete(console, caller, found)
+
+
+def _delete(console: Console, caller: Caller, scan_ids: list[str]) -> Removed:
+    for scan_id in scan_ids:
         console.audit.note(caller.name, caller.address, "delete", scan_id)
-        purge_scan(console.spool, scan_id)
-    return Removed(scans=found)
+    removed = retention.Removed()
+    retention.purge_scans(console.spool, scan_ids, removed)
+    return Removed(scans=scan_ids, handed_over=sorted(removed.receivers))
 
 
 def of_record(console: Console, record: ScanRecord) -> Scan:

@@ -13,7 +13,7 @@ import lives
 
 from station.archive.index import ScanIndex
 from station.archive.tables import FILES
-from station.booth.retention import expire_old, purge_scan, traces
+from station.booth.retention import Removed, expire_old, purge_scans, traces
 from station.core.config import RetentionConfig
 from station.core.files import private_folder
 from station.core.spool import Claim, Spool
@@ -33,7 +33,7 @@ def hand_over(folder: Path) -> None:
     """A hand-over's life: followed, tried in vain, tried again, recorded."""
     spool = Spool(folder / "spool")
     ledger, index = Ledger(spool.folder), ScanIndex(spool)
-    ledger.follow(_TARGET, [found.scan_id for found in index.find()])
+    ledger.follow(_TARGET, [found.scan_id for found in index.find()], [])
     for entry in ledger.waiting():
         _try(ledger, index, spool, entry)
 
@@ -98,7 +98,7 @@ def fail_and_purge(folder: Path) -> None:
         if spool.path("failed", lives.SCAN).exists():
             spool.retry(lives.SCAN)
     expire_old(spool, RetentionConfig())
-    purge_scan(spool, lives.SCAN)
+    purge_scans(spool, [lives.SCAN], Removed())
     ScanIndex(spool).find(limit=0)
 
 
