@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
-from workers.scape.surface.crossings import Pairs, crossing_pairs
+from workers.scape.surface.crossings import Pairs, at_vertices, crossing_pairs
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -82,7 +82,7 @@ def _pushed(model: BodyModel, vertices: Array, measured: Mask, pairs: Pairs, hol
             motion[follows] = _FOLLOWING * (linked[follows] @ motion)
         current = current + motion
         moved: Mask = np.asarray(motion.any(axis=1))
-        tested = np.asarray(moved[model.faces].any(axis=1))
+        tested = at_vertices(moved, model.faces)
         crossing = _contacts(model, crossing_pairs(current, model.faces, tested))
     return _without_vain(vertices, current, first, crossing, linked)
 

@@ -12,13 +12,20 @@ from numpy.typing import NDArray
 from workers.scape.model.deformation import Faces
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Pairs = NDArray[np.int32]
 
 _CELL_M = 0.02
 """Cell size of the grid that finds triangles near those that are tested."""
 
 
-def crossing_pairs(vertices: Array, faces: Faces, tested: NDArray[np.bool_] | None = None) -> Pairs:
+def at_vertices(vertices: Mask, faces: Faces) -> Mask:
+    """Mask (K,) of triangles with a corner among some vertices (P,)."""
+    # A quarter of the time that `any` takes over three columns.
+    return np.asarray(vertices[faces[:, 0]] | vertices[faces[:, 1]] | vertices[faces[:, 2]])
+
+
+def crossing_pairs(vertices: Array, faces: Faces, tested: Mask | None = None) -> Pairs:
     """Pairs (m, 2) of triangles that cross.
 
     Triangles that share a vertex count if they cross elsewhere; triangles that share an edge cannot
@@ -29,8 +36,7 @@ def crossing_pairs(vertices: Array, faces: Faces, tested: NDArray[np.bool_] | No
         faces: (K, 3).
         tested: (K,), pairs without one of these triangles are left out; all by default.
     """
-    corners = np.ascontiguousarray(vertices[faces])
-    lows, highs = _boxes(corners)
+    lows, highs = _boxes(vertices, faces)
     if tested is None:
         tested = np.ones(len(faces), bool)
         near = np.arange(len(faces))
@@ -41,19 +47,21 @@ def crossing_pairs(vertices: Array, faces: Faces, tested: NDArray[np.bool_] | No
         return np.empty((0, 2), np.int32)
     upwards = near[np.argsort(lows[near, 2], kind="stable")]
     found = _crossing_pairs(
-        corners[upwards], lows[upwards], highs[upwards], faces[upwards], tested[upwards]
+        vertices[faces[upwards]], lows[upwards], highs[upwards], faces[upwards], tested[upwards]
     )
     return np.sort(upwards[found], axis=1).astype(np.int32)
 
 
 @numba.njit(cache=True, nogil=True)
-def _boxes(corners):  # type: ignore[no-untyped-def]  # pragma: no cover
-    lows, highs = corners[:, 0].copy(), corners[:, 0].copy()
-    for k in range(len(corners)):
-        for i in range(1, 3):
-            for c in range(3):
-                lows[k, c] = min(lows[k, c], corners[k, i, c])
-                highs[k, c] = max(highs[k, c], corners[k, i, c])
+def _boxes(vertices, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Least and largest coordinates (K, 3) of each triangle."""
+    lows, highs = np.empty((len(faces), 3)), np.empty((len(faces), 3))
+    for k in range(len(faces)):
+        one, two, three = faces[k, 0], faces[k, 1], faces[k, 2]
+        for c in range(3):
+            x, y, z = vertices[one, c], vertices[two, c], vertices[three, c]
+            lows[k, c] = min(x, y, z)
+            highs[k, c] = max(x, y, z)
     return lows, highs
 
 

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import Faces, area_vectors, vertex_normals
 from workers.scape.surface.contacts import grown, neighbour_mean, parted
-from workers.scape.surface.crossings import Pairs, crossing_pairs
+from workers.scape.surface.crossings import Pairs, at_vertices, crossing_pairs
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -113,7 +113,7 @@ def untangled(
         current = relaxed
         changed = np.zeros(len(vertices), bool)
         changed[patch] = changed[yielding] = True
-        crossing = crossing_pairs(current, faces, np.asarray(changed[faces].any(axis=1)))
+        crossing = crossing_pairs(current, faces, at_vertices(changed, faces))
     else:
         bad = _bad(current, reference, faces, crossing)
     farthest_m = np.where(measured, _MEASURED_YIELDS_M, _DEEPEST_M)
