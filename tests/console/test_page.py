@@ -144,10 +144,16 @@ def test_another_language_says_the_same(console: LiveConsole) -> None:
         page.select_option("#language", "zh")
         expect(ended).to_have_text("扫描已取消", timeout=LONG_MS)
         expect(page.locator("html")).to_have_attribute("lang", "zh-CN")
-        page.select_option("#language", "en")
+        # The second time before the first one is drawn.
+        for language in ("en", "zh", "en"):
+            page.select_option("#language", language)
         expect(ended).to_have_text("The scan was cancelled", timeout=LONG_MS)
         open_view(page, console, "history")
         expect(page.locator("#search")).to_be_visible(timeout=LONG_MS)
+        # What was left is not taken up again.
+        for language, words in (("zh", "记录"), ("en", "History")):
+            page.select_option("#language", language)
+            expect(page.locator("h1")).to_have_text(words, timeout=LONG_MS)
         open_view(page, console, "scan")
         expect(page.locator("#label")).to_be_visible(timeout=LONG_MS)
 

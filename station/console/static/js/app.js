@@ -43,7 +43,7 @@ async function speak(language) {
   await load(session.language);
   drawRail();
   document.getElementById('language').focus();
-  show();
+  show({ again: true });
 }
 
 async function load(fallback) {
@@ -61,7 +61,7 @@ function wanted() {
   return [VIEWS[name] ? name : 'scan', rest];
 }
 
-async function show() {
+async function show({ again = false } = {}) {
   const [view, rest] = wanted();
   const mine = ++turn;
   leave();
@@ -75,7 +75,7 @@ async function show() {
     const draw = await VIEWS[view]();
     // Drawn aside: a slow view that was left meanwhile must not cover the one that came after it.
     const place = h('div');
-    const left = await draw(place, session, ...rest.map(decodeURIComponent));
+    const left = await draw(place, { ...session, again }, ...rest.map(decodeURIComponent));
     if (mine !== turn) { left(); return; }
     main.replaceChildren(place);
     leave = left;
@@ -114,7 +114,7 @@ listen((kind) => {
     notice(t('back'));
   }
 });
-window.addEventListener('hashchange', show);
+window.addEventListener('hashchange', () => show());
 window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
 VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for

@@ -5,7 +5,7 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { currentLanguage, outcome, said, t, time } from './i18n.js';
+import { outcome, said, t, time } from './i18n.js';
 import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
@@ -13,10 +13,11 @@ const FINAL = ['delivered', 'rescan', 'failed'];
 const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
 
-// What the view told when it was left, in which language: it is told on in another one.
+// What the view told when it was left: it is told on where it is drawn again in another language.
 let kept = null;
 
 export async function scan(main, session) {
+  if (!session.again) kept = null;
   const state = await get('/booth');
   const front = state.cameras.map((camera) => camera.name).filter((name) => name.startsWith('front'));
   const shown = front.length ? front : state.cameras.slice(0, 2).map((camera) => camera.name);
@@ -238,15 +239,13 @@ export async function scan(main, session) {
         h('section', { className: 'card' }, h('h2', {}, t('scan.last')), list))));
   showTroubles(state);
   const looking = setInterval(look, TROUBLES_MS);
-  const language = currentLanguage();
-  const told = kept?.language === language ? null : kept;
-  kept = null;
+  const told = kept;
   if (told) ({ label, pressed, took } = told);
   ready();
   if (told?.current) follow(told.current);
   latest();
   return () => {
-    kept = { language, label, pressed, took, current };
+    kept = { label, pressed, took, current };
     clearInterval(timer);
     clearInterval(looking);
     silence();
