@@ -78,13 +78,15 @@ class LiveConsole:
     def start_sensors(self) -> None:
         with self.client() as client:
             client.post("/booth/start").raise_for_status()
-            self.station.wait_until(
-                lambda: all(
-                    camera["state"] == "streaming"
-                    for camera in client.get("/booth").json()["cameras"]
-                ),
-                "every camera streams",
-            )
+            self._wait_for(client, "streaming")
+
+    def _wait_for(self, client: httpx.Client, state: str) -> None:
+        self.station.wait_until(
+            lambda: all(
+                camera["state"] == state for camera in client.get("/booth").json()["cameras"]
+            ),
+            f"every camera is {state}",
+        )
 
     @contextmanager
     def sensors(self) -> Iterator[None]:
@@ -100,6 +102,7 @@ class LiveConsole:
             self._sensors = False
             with self.client() as client:
                 client.post("/booth/stop").raise_for_status()
+                self._wait_for(client, "off")
 
     def scan(self, label: str) -> dict[str, Any]:
         """Take a scan and wait for its result; again while a busy machine's cameras are late."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
 from station.core.files import private_file
+from station.core.scans import is_scan_id
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -111,11 +112,6 @@ class ScanIndex:
         rows = self._rows(f"SELECT {_COLUMNS} FROM scans WHERE scan_id = ?", scan_id)
         return _record(rows[0]) if rows else None
 
-    def ids_of(self, label: str) -> list[str]:
-        """Ids of all scans with exactly this label, however many they are."""
-        query = "SELECT scan_id FROM scans WHERE label = ? ORDER BY scan_id"
-        return [row[0] for row in self._rows(query, label)]
-
     def _rows(self, query: str, *values: str | int) -> list[tuple[str, ...]]:
         """Answer of the database, brought up to date with the folders.
 
@@ -179,7 +175,8 @@ class ScanIndex:
             rows = dict(database.execute("SELECT scan_id, place FROM scans"))
             # Later folders overwrite: a result's bundle may not have been put away yet.
             found = {name: place for place in PLACES for name in _names(self._spool.folder / place)}
-            for scan_id in rows.keys() - found.keys():
+            gone = rows.keys() - found.keys()
+            for scan_id in gone:
                 database.execute("DELETE FROM scans WHERE scan_id = ?", [scan_id])
             for scan_id, place in found.items():
                 if rows.get(scan_id) != place:
@@ -189,6 +186,9 @@ class ScanIndex:
             database.executemany(
                 "INSERT OR REPLACE INTO folders VALUES (?, ?)", list(settled.items())
             )
+        if gone:
+            # While others have the database open, its log keeps the labels of deleted scans.
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def _changed_ns(self, place: str) -> int:
         try:
@@ -254,7 +254,7 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
 def _names(folder: Path) -> list[str]:
     try:
         with os.scandir(folder) as entries:
-            return [entry.name for entry in entries if not entry.name.startswith(".")]
+            return [entry.name for entry in entries if is_scan_id(entry.name)]
     except OSError:
         return []
 

@@ -131,6 +131,9 @@ class ControlProcess:
         """
         try:
             self._spool.sweep()
+        except OSError as error:
+            self._log.warning("what was left unfinished could not be removed: %s", error)
+        try:
             if self._purge is not None:
                 # It hangs, or there is very much; the next one goes on where this one ends.
                 self._purge.kill()
@@ -247,13 +250,15 @@ class ControlProcess:
                 return answer
             # Sync is still writing its decision to disk.
             return Reply(ok=True, content={**status, "reason": CANCELLED})
-        if status["state"] != "accepted" or not self._spool.withdraw(scan_id, CANCELLED):
+        withdrawn = status["state"] == "accepted" and self._spool.withdraw(scan_id, CANCELLED)
+        status = self._scan_status(scan_id)
+        if not withdrawn:
             return Reply(
                 ok=False,
                 error=f"scan {scan_id} can no longer be cancelled (its state is "
                 f"{status['state']}); when it is done, delete it with: station purge {scan_id}",
             )
-        return Reply(ok=True, content=self._scan_status(scan_id))
+        return Reply(ok=True, content=status)
 
     def _comes_until_s(self, scan_id: ScanId) -> float:
         """Moment until which sync may get a scan's order after its cancel, which overtakes it while

@@ -1,4 +1,4 @@
-"""Retention of body scans, and the deletion of one.
+"""Retention of body scans: what is kept too long is removed.
 
 A wall clock may jump: a dead battery, a mistyped date. So time is counted in a file of the spool
 (`retention.json`): within a boot by the kernel's clock since the boot, from one boot to the next by
@@ -9,23 +9,18 @@ deletes later, never earlier.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import click
-
-from station.archive.index import ScanIndex
-from station.core.commands import config_option
 from station.core.config import RetentionConfig
-from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
-from station.core.files import delete, held, read_bounded_json, write_bytes
-from station.core.scans import STATES, ScanId, boot_id, scan_id_of
+from station.core.files import held, read_bounded_json, write_bytes
+from station.core.scans import STATES, ScanId, boot_id
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
 
@@ -34,10 +29,9 @@ _LOCK = "retention.lock"
 LONGEST_OFF_S = 4 * 86_400.0
 """A long weekend."""
 _DAY_S = 86_400.0
-_MAX_BYTES = 16 << 20
+_MAX_BYTES = 256 << 20
+"""Two million scans: more than a spool can have, or the file could be written and not read."""
 _BUSY = SpoolError("old scans are being removed at the moment; try again")
-_ORDER_S = 60.0
-"""Time after which a scan without a bundle is no longer being taken, from its order on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +84,16 @@ def due(ages: Ages, folders: list[str], limits_s: dict[str, float]) -> tuple[Age
     return replace(ages, seen_s=seen), old
 
 
-def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = None) -> list[Path]:
+def expire_old(
+    spool: Spool,
+    retention: RetentionConfig,
+    now: Moment | None = None,
+    *,
+    removed: list[Path] | None = None,
+) -> list[Path]:
     """Remove bundles of delivered scans, results, failed scans and notes that are past their time.
+
+    Returns what was removed. It is added to ``removed``, if given, also where the disk refuses.
 
     Raises:
         OSError: the disk refuses; what it lets go is removed all the same.
@@ -113,7 +115,8 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
         ]
         folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
         ages, old = due(ages, folders, limits_s)
-        removed, refused = list[Path](), list[OSError]()
+        removed = [] if removed is None else removed
+        refused: list[OSError] = []
         for name in old:
             try:
                 if _expire(spool, name):
@@ -123,6 +126,9 @@ def expire_old(spool: Spool, retention: RetentionConfig, now: Moment | None = No
             except OSError as error:
                 refused.append(error)
         _save(spool, ages)
+        Ledger(spool.folder).prune(
+            lambda name: _exists(spool, f"outbox/{name}") or _exists(spool, f"scans/{name}")
+        )
     if refused:
         raise refused[0]
     return removed
@@ -133,7 +139,7 @@ def _expire(spool: Spool, name: str) -> bool:
     state, scan_id = name.split("/", 1)
     if state != "scans":
         spool.remove(spool.folder / name)
-        if state == "outbox":
+        if state == "outbox" and not _exists(spool, f"scans/{scan_id}"):
             Ledger(spool.folder).forget(scan_id)
         return True
     if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
@@ -143,14 +149,32 @@ def _expire(spool: Spool, name: str) -> bool:
     return False
 
 
+def forget_removed(spool: Spool) -> None:
+    """Keep no names of scans that no longer exist."""
+    # Whoever removes old scans just now forgets them, too; so does the next one.
+    with suppress(SpoolError, OSError), held(spool.folder / _LOCK, _BUSY):
+        _save(spool, _load(spool))
+
+
 def _load(spool: Spool) -> Ages:
+    """The ages so far.
+
+    Raises:
+        OSError: the file cannot be read at the moment.
+    """
     try:
         document: dict[str, Any] = read_bounded_json(spool.folder / FILE, _MAX_BYTES)
         seen = {str(name): float(value) for name, value in document["seen_s"].items()}
-        last = document["last"]
+        last, counted_s = document["last"], float(document["counted_s"])
         moment = Moment(float(last["wall_s"]), float(last["since_boot_s"]), str(last["boot"]))
-        return Ages(float(document["counted_s"]), moment, seen)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        times = (counted_s, moment.wall_s, moment.since_boot_s, *seen.values())
+        if not all(map(math.isfinite, times)) or not all("/" in name for name in seen):
+            return Ages()
+        return Ages(counted_s, moment, seen)
+    except (
+        FileNotFoundError, ValueError, KeyError, TypeError, AttributeError, OverflowError,
+        RecursionError,
+    ):  # fmt: skip
         # All start to age now, which deletes late, never early.
         return Ages()
 
@@ -168,144 +192,3 @@ def _exists(spool: Spool, name: str) -> bool:
     if state == "scans":
         return spool.notes.path(ScanId(scan_id)).exists()
     return (spool.folder / name).exists()
-
-
-def traces(spool: Spool, scan_id: ScanId) -> list[Path]:
-    """Everything under the spool that bears a scan's name: folders, notes, locks, leftovers."""
-    found = []
-    for folder in sorted(spool.folder.iterdir()):
-        if folder.is_dir() and not folder.is_symlink():
-            found += [entry for entry in sorted(folder.iterdir()) if _names(entry.name, scan_id)]
-    return found
-
-
-def _names(name: str, scan_id: ScanId) -> bool:
-    plain = name.removeprefix(".")
-    return plain == scan_id or plain.startswith(f"{scan_id}.")
-
-
-@dataclass(slots=True)
-class Removed:
-    """Files that were deleted, also where the disk refused to delete the rest."""
-
-    paths: list[Path] = field(default_factory=list)
-    receivers: set[str] = field(default_factory=set)
-    """Targets that have copies, which stay there."""
-
-
-def purge_scans(spool: Spool, scan_ids: Sequence[str], removed: Removed) -> None:
-    """Delete scans: their bundles, results, notes and names; all of them or, if one is refused,
-    none. What is deleted is added to ``removed``.
-
-    Raises:
-        InputError: one is not a valid scan id.
-        SpoolError: one does not exist, or is being taken or reconstructed.
-    """
-    # Not all locks at once: a label may have more scans than a process may open files.
-    for scan_id in scan_ids:
-        with _removable(spool, scan_id):
-            pass
-    for scan_id in scan_ids:
-        with _removable(spool, scan_id) as paths:
-            _purge(spool, scan_id, paths, removed)
-    # Whoever removes old scans just now forgets these, too.
-    with suppress(SpoolError), held(spool.folder / _LOCK, _BUSY):
-        _save(spool, _load(spool))
-
-
-def _purge(spool: Spool, scan_id: str, paths: list[Path], removed: Removed) -> None:
-    ledger = Ledger(spool.folder)
-    receivers = ledger.receivers(scan_id)
-    for path in paths:
-        if path.parent.name in STATES:
-            spool.remove(path)
-        else:
-            delete(path)
-        removed.paths.append(path)
-    # Nothing else knows of the copies from now on.
-    removed.receivers.update(receivers)
-    ledger.forget(scan_id)
-
-
-@contextmanager
-def _removable(spool: Spool, scan_id: str) -> Iterator[list[Path]]:
-    """Everything that is kept of a scan, while no other process may change it."""
-    name = scan_id_of(scan_id)
-    lock = spool.lock(name)
-    try:
-        if lock is None or spool.path("work", name).exists():
-            raise SpoolError(f"scan {name} is being reconstructed; try again when it is done")
-        note = spool.notes.read(name)
-        if note is not None and note.stage in ("armed", "capturing"):
-            age_s = time.time() - spool.notes.path(name).stat().st_mtime
-            if spool.where(name) is None and 0.0 <= age_s < _ORDER_S:
-                raise SpoolError(f"scan {name} is being taken; try again when it is done")
-        found = [path for path in traces(spool, name) if path.parent.name != "locks"]
-        if not found:
-            raise SpoolError(f"there is no scan {name} in {spool.folder}")
-        yield found
-    finally:
-        if lock is not None:
-            spool.unlock(name, lock)
-
-
-@click.command()
-@click.argument("scan_id", required=False)
-@config_option
-@click.option("--label", help="delete all scans with exactly this label")
-@click.option("--old", is_flag=True, help="remove everything past its retention period")
-def purge(scan_id: str | None, config_path: Path | None, label: str | None, old: bool) -> None:
-    """Delete a scan and its results, all scans with a label, or all that are past their retention
-    period.
-
-    \b
-    Examples:
-      station purge 20261121T100000Z-7f3a
-      station purge --label "Order 1234"
-      station purge --old
-    """
-    if sum([bool(scan_id), label is not None, old]) != 1:
-        raise click.UsageError("give a scan id, --label or --old")
-    config = load_config(find_config(config_path))
-    spool = Spool(config.spool.folder)
-    removed = Removed()
-    try:
-        if old:
-            removed.paths = expire_old(spool, config.retention)
-        else:
-            scans = [scan_id] if scan_id else _labelled(spool, str(label))
-            purge_scans(spool, scans, removed)
-    finally:
-        for path in removed.paths:
-            click.echo(f"removed {path}")
-        if removed.receivers:
-            click.echo(f"copies handed over to {', '.join(sorted(removed.receivers))} stay there")
-    if old and not removed.paths:
-        click.echo("nothing is past its retention period")
-    # Labels leave the index together with the scans, not at the next query.
-    ScanIndex(spool).find(limit=0)
-
-
-def _labelled(spool: Spool, label: str) -> list[str]:
-    found = ScanIndex(spool).ids_of(label)
-    if not found:
-        raise SpoolError(
-            f"there is no scan with the label {label!r}; see station list; "
-            "a scan that is being taken is ended with station cancel"
-        )
-    return found
-
-
-@click.command()
-@click.argument("scan_id")
-@config_option
-def retry(scan_id: str, config_path: Path | None) -> None:
-    """Reconstruct a failed scan again.
-
-    \b
-    Examples:
-      station retry 20261121T100000Z-7f3a
-    """
-    config = load_config(find_config(config_path))
-    Spool(config.spool.folder).retry(scan_id_of(scan_id))
-    click.echo(f"scan {scan_id} is waiting to be reconstructed")

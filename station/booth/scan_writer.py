@@ -232,9 +232,17 @@ class ScanWriter:
     def _settle_abandoned(self) -> None:
         """Fail the scans that an earlier sync process left unfinished: nobody collects them."""
         spool = self._spool
-        self._retried(spool.sweep)
+        try:
+            spool.sweep()
+        except OSError as error:
+            self._log.warning("what was left unfinished could not be removed: %s", error)
         for scan_id in self._retried(spool.notes.ids):
-            note = self._retried(partial(spool.notes.read, scan_id))
+            try:
+                note = spool.notes.read(scan_id)
+            except OSError as error:
+                # One file that cannot be read must not keep all scans waiting.
+                self._log.warning("the note of scan %s cannot be read: %s", scan_id, error)
+                continue
             if note is None or note.stage not in ("armed", "capturing"):
                 continue
             same_boot = note.boot == boot_id()

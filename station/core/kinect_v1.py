@@ -79,6 +79,7 @@ TABLE: NDArray[np.uint16] = np.rint(depth_m_of_raw(np.arange(2048)) / DEPTH_SCAL
     np.uint16
 )
 """Depth frame value of each raw value, (2048,)."""
+_RAW_BITS = 0x7FF
 _ROWS_AT_ONCE = 24
 """Their indices stay in the processor's cache, and in memory that is not given back."""
 
@@ -89,5 +90,5 @@ def depth_of_raw(raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
     for row in range(0, len(raw), _ROWS_AT_ONCE):
         rows = np.s_[row : row + _ROWS_AT_ONCE]
         # No value is out of bounds; to check each would take half as long again.
-        TABLE.take(raw[rows] & NO_READING, out=depth[rows], mode="clip")
+        TABLE.take(raw[rows] & _RAW_BITS, out=depth[rows], mode="clip")
     return depth

@@ -24,6 +24,7 @@ stays until the retention period ends, so that no scan is delivered twice.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import secrets
@@ -117,6 +118,15 @@ class ScanNote:
     """Number of workers' processes that ended meanwhile; most likely no fault of the scan."""
 
 
+def sweep_unwritten(folder: Path) -> None:
+    """Remove files that were being written when their writer was killed."""
+    for entry in entries_of(folder):
+        with suppress(OSError):
+            written_s = time.time() - entry.stat().st_mtime
+            if entry.name[0] == "." and entry.is_file() and written_s > _WRITTEN_S:
+                delete(entry)
+
+
 class Notes:
     """The notes of all scans of a spool."""
 
@@ -153,10 +163,7 @@ class Notes:
 
     def sweep(self) -> None:
         """Remove what killed writers left beside the notes: it bears a scan's label, too."""
-        for entry in entries_of(self.folder):
-            with suppress(OSError):
-                if entry.name[0] == "." and time.time() - entry.stat().st_mtime > _WRITTEN_S:
-                    delete(entry)
+        sweep_unwritten(self.folder)
 
     def ids(self) -> list[ScanId]:
         """The ids of all scans that have a note."""
@@ -178,7 +185,14 @@ def _note(document: Any, scan_id: ScanId) -> ScanNote:
     values = {key: value for key, value in document.items() if key in known}
     if not all(isinstance(value, _TYPES.get(key, str)) for key, value in values.items()):
         raise ValueError("a field of the scan's note has another type")
-    return ScanNote(scan_id=scan_id, **values)
+    note = ScanNote(scan_id=scan_id, **values)
+    # What cannot be written again would end whoever goes on with the scan.
+    json.dumps(values, allow_nan=False, ensure_ascii=False).encode()
+    if note.result and not note.result.startswith(f"{scan_id}."):
+        raise ValueError("another scan's result, or none")
+    if note.stage == "delivering" and not note.result:
+        raise ValueError("a result without a name")
+    return note
 
 
 class ScanFolders:
@@ -195,7 +209,8 @@ class ScanFolders:
 
     def temporary(self, name: str) -> Path:
         """A new name in the spool's own file system; the caller makes the folder."""
-        return self.folder / "tmp" / f"{name}.{os.getpid()}.{time.monotonic_ns()}"
+        made_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        return self.folder / "tmp" / f"{name}.{os.getpid()}.{made_ns}"
 
     def remove(self, folder: Path) -> None:
         """Delete a folder, or what else lies in its place: it leaves that at once, so that nobody

@@ -26,7 +26,16 @@ from station.core.files import (
     publish_folder,
     write_json,
 )
-from station.core.scans import REASON, ScanFolders, ScanId, ScanNote, Stage, boot_id, is_scan_id
+from station.core.scans import (
+    REASON,
+    ScanFolders,
+    ScanId,
+    ScanNote,
+    Stage,
+    boot_id,
+    is_scan_id,
+    sweep_unwritten,
+)
 
 MAX_DEATHS = 10
 """Ends of the station, unlike those of a job, do not count as tries of a scan; a scan during which
@@ -103,17 +112,21 @@ class Spool(ScanFolders):
         absent = SpoolError(
             f"scan {scan_id} is not among the failed scans in {bundle.parent}; see station list"
         )
+        if not bundle.is_dir():
+            raise absent
         lock = self.lock(scan_id)
         if lock is None:
-            raise absent
+            raise SpoolError(f"scan {scan_id} is in use at the moment; try again")
         try:
-            if not bundle.is_dir():
-                raise absent
             fresh = ScanNote(scan_id, "accepted", label=self.note(scan_id).label)
             self.notes.write(fresh, durable=True)
             (bundle / REASON).unlink(missing_ok=True)
             os.rename(bundle, self.path("queue", scan_id))
             fsync_folder(self.folder / "queue")
+        except FileNotFoundError:
+            # It was past its time, or deleted, just now.
+            self.notes.remove(scan_id)
+            raise absent from None
         finally:
             self.unlock(scan_id, lock)
 
@@ -191,6 +204,9 @@ class Spool(ScanFolders):
             with contextlib.suppress(OSError):
                 delete(entry)
         self.notes.sweep()
+        # Names of scans, and of whom they were handed over to.
+        for folder in (self.folder, *self.folder.glob("handover/*/waiting")):
+            sweep_unwritten(folder)
 
     def lock(self, scan_id: ScanId) -> int | None:
         """The scan's lock, or None while a living process holds it."""
@@ -221,9 +237,19 @@ class Spool(ScanFolders):
 
 
 def _writer_lives(name: str) -> bool:
-    """Whether the process that made a temporary name (`name.<pid>.<ns>`) still runs."""
-    parts = name.split(".")
-    return len(parts) > 2 and parts[-2].isdigit() and Path(f"/proc/{parts[-2]}").exists()
+    """Whether the process that made a temporary name (`name.<pid>.<ns>`) still runs.
+
+    Its number may be another process's by now, and is after each boot.
+    """
+    *_, pid, made_ns = ["", "", *name.split(".")]
+    if not (pid.isdecimal() and made_ns.isdecimal()):
+        return False
+    try:
+        # What follows the name, which may have any characters: its start, in ticks since the boot.
+        started = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        return False
+    return started / os.sysconf("SC_CLK_TCK") <= int(made_ns) / 1e9
 
 
 class Claim:

@@ -26,6 +26,7 @@ _POLL_S = 0.2
 _SETTLED_NS = 1_000_000_000
 """Age below which a folder is read again: changes within one tick of the file system's clock look
 like one."""
+_REFUSED_S = 30.0
 _RESULTS = 100_000
 _HANGS_S = 60.0
 """A try takes at most ten seconds at a webhook; a folder's may wait indefinitely for a lost
@@ -43,6 +44,8 @@ class HandOver:
         self._targets = {section.name: make_target(section) for section in config.deliver}
         self._round_s = dict.fromkeys(self._targets, time.monotonic())
         """Moment of each target's last progress, monotonic seconds."""
+        self._refused: dict[str, str] = {}
+        """Targets that wait for the spool's disk, and in which words."""
         self._heart = Heartbeat(config.runtime.folder, "deliver")
 
     def run(self, stop: threading.Event) -> None:
@@ -73,6 +76,7 @@ class HandOver:
         """Health report: the number of results that wait for each target, and problems."""
         waiting = self._ledger.waiting()
         problems = [problem] if problem else []
+        problems += self._refused.values()
         counts = {}
         now_s = time.monotonic()
         for name in self._targets:
@@ -104,8 +108,17 @@ class HandOver:
             self._round_s[name] = time.monotonic()
             try:
                 self.try_all(name, time.time())
-            except (BoothError, OSError) as error:
+                self._refused.pop(name, None)
+            except BoothError as error:
                 self._log.warning("%s: %s", name, error)
+            except OSError as error:
+                self._refused[name] = (
+                    f"deliver {name}: it cannot be recorded what is handed over ({error}); "
+                    "check the spool's disk"
+                )
+                self._log.warning("%s", self._refused[name])
+                # At once, the target would receive the same result several times a second.
+                stop.wait(_REFUSED_S)
 
     def try_all(self, name: str, now_s: float) -> None:
         """Hand over the results that are due to one target."""
@@ -113,14 +126,19 @@ class HandOver:
             if entry.target == name and entry.due(now_s):
                 self._round_s[name] = time.monotonic()
                 self._try(entry, now_s)
-                if not self._is_known(ScanId(entry.scan_id)):
-                    # Deleted during the try, whose end was recorded after that.
-                    self._ledger.forget(entry.scan_id)
+                self._settle(entry)
 
-    def _is_known(self, scan_id: ScanId) -> bool:
-        """Whether a scan still has a result, or a note because its result was taken away."""
-        places = self._spool.path("outbox", scan_id), self._spool.notes.path(scan_id)
-        return any(place.exists() for place in places)
+    def _settle(self, entry: Waiting) -> None:
+        """Wait for no result that is gone: what became of a try was recorded after that."""
+        if self._spool.path("outbox", entry.scan_id).exists():
+            return
+        self._ledger.drop(entry)
+        if self._spool.notes.path(ScanId(entry.scan_id)).exists():
+            return
+        if entry.target in self._ledger.receivers(entry.scan_id):
+            words = "scan %s was deleted while it was handed over to %s, which has a copy"
+            self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
+        self._ledger.forget(entry.scan_id)
 
     def _try(self, entry: Waiting, now_s: float) -> None:
         scan: ScanRecord | None = self._index.get(entry.scan_id)

@@ -7,7 +7,7 @@ handover/<target>/done/<scan id>           handed over; kept as long as the resu
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,7 +32,7 @@ class Waiting:
 
     def due(self, now_s: float) -> bool:
         """Whether it is time for the next try; a wall clock that was put back delays none."""
-        return self.next_s <= now_s or self.next_s > now_s + PAUSES_S[-1]
+        return self.next_s <= now_s or not self.next_s <= now_s + PAUSES_S[-1]
 
     def document(self) -> dict[str, Any]:
         moment = datetime.fromtimestamp(self.next_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -41,7 +41,7 @@ class Waiting:
 
     def failed(self, error: str, now_s: float) -> Waiting:
         """The entry after one more failure, with a longer pause."""
-        pause_s = PAUSES_S[min(self.tries, len(PAUSES_S) - 1)]
+        pause_s = PAUSES_S[min(max(self.tries, 0), len(PAUSES_S) - 1)]
         return replace(self, tries=self.tries + 1, next_s=now_s + pause_s, error=error)
 
 
@@ -67,7 +67,8 @@ class Ledger:
             if path.stem not in there:
                 path.unlink(missing_ok=True)
         for scan_id in there:
-            if not (done / scan_id).exists() and not (waiting / f"{scan_id}.json").exists():
+            # In this order: `finish` ends the waiting after it has recorded the hand-over.
+            if not (waiting / f"{scan_id}.json").exists() and not (done / scan_id).exists():
                 self.keep(Waiting(target, scan_id))
 
     def keep(self, entry: Waiting) -> None:
@@ -80,8 +81,21 @@ class Ledger:
         done = self._place(entry.target, "done")
         private_file(done / entry.scan_id)
         fsync_folder(done)
+        self.drop(entry)
+
+    def drop(self, entry: Waiting) -> None:
+        """Wait no longer to hand over a result."""
         waiting = self._place(entry.target, "waiting")
         (waiting / f"{entry.scan_id}.json").unlink(missing_ok=True)
+
+    def prune(self, is_known: Callable[[str], bool]) -> None:
+        """Keep nothing of scans that are not known, also of targets that booth.toml named before.
+
+        Each is asked for just before: one that comes meanwhile must not be forgotten.
+        """
+        for path in [*self._folder.glob("*/done/*"), *self._folder.glob("*/waiting/*.json")]:
+            if not is_known(path.name.removesuffix(".json")):
+                path.unlink(missing_ok=True)
 
     def receivers(self, scan_id: str) -> list[str]:
         """Targets that have a copy of a scan's result; also those that booth.toml named before."""
@@ -101,11 +115,13 @@ class Ledger:
             return []
         found = []
         for path in sorted(self._folder.glob("*/waiting/*.json")):
+            if (path.parents[1] / "done" / path.stem).exists():
+                continue  # the end of a hand-over was cut short
             try:
                 document = json.loads(path.read_bytes())
                 entry = Waiting(path.parent.parent.name, path.stem, int(document["tries"]),
                                 float(document["next_s"]), str(document["error"]))  # fmt: skip
-            except (OSError, ValueError, KeyError, TypeError):
+            except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
                 entry = Waiting(path.parent.parent.name, path.stem)
             found.append(entry)
         return found

@@ -59,22 +59,36 @@ class FolderTarget:
                 return
             if not self._folder.is_dir():
                 raise HandOverError(f"{self._folder} does not exist; is the share mounted?")
-            if beside.exists():
-                shutil.rmtree(beside)
-            shutil.copytree(result, beside)
-            document = read_measurements(result, "as-scanned")
-            (beside / "individual.smis").write_bytes(smis(scan, document))
-            for pose, name in FILES.items():
-                table = csv_table(scan, read_measurements(result, pose), "cm", "en")
-                (beside / name).with_suffix(".csv").write_text(table, encoding="utf-8", newline="")
-            for path in beside.iterdir():
-                fsync_file(path)
-            fsync_folder(beside)
-            beside.rename(final)
+            try:
+                _copy(scan, result, beside)
+                beside.rename(final)
+            except BaseException:
+                # Nobody would remove it if the scan is deleted before the next try.
+                shutil.rmtree(beside, ignore_errors=True)
+                raise
             fsync_folder(self._folder)
+        except shutil.Error as cause:
+            # Of each file: from where, to where, why not.
+            _, _, reason = cause.args[0][0]
+            raise HandOverError(f"{self._folder} cannot be written ({reason})") from None
         except OSError as cause:
             reason = cause.strerror or cause
             raise HandOverError(f"{self._folder} cannot be written ({reason})") from None
+
+
+def _copy(scan: ScanRecord, result: Path, beside: Path) -> None:
+    """Copy a result, with tables for other programs, to a folder that is on the disk then."""
+    if beside.exists():
+        shutil.rmtree(beside)
+    shutil.copytree(result, beside)
+    document = read_measurements(result, "as-scanned")
+    (beside / "individual.smis").write_bytes(smis(scan, document))
+    for pose, name in FILES.items():
+        table = csv_table(scan, read_measurements(result, pose), "cm", "en")
+        (beside / name).with_suffix(".csv").write_text(table, encoding="utf-8", newline="")
+    for path in beside.iterdir():
+        fsync_file(path)
+    fsync_folder(beside)
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):

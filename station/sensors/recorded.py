@@ -12,6 +12,7 @@ from station.core.drivers import CameraConfig, ConfigPath
 from station.core.errors import DriverError, FormatError
 from station.core.kinect_v1 import (
     DEPTH_SCALE_M,
+    FRAME_RATE_HZ,
     HEIGHT,
     TICK_BITS,
     TICK_HZ,
@@ -73,6 +74,7 @@ class RecordedDriver:
         first_s, last_s = self._frames[0][0], self._frames[-1][0]
         passes, index = divmod(self._sequence, len(self._frames))
         period_s = (last_s - first_s) * (1.0 + 1.0 / max(len(self._frames) - 1, 1))
+        period_s = max(period_s, 1.0 / FRAME_RATE_HZ)  # a single frame
         seconds, ticks, path = self._frames[index]
         wait_s = self._start_s + passes * period_s + seconds - first_s - time.monotonic()
         time.sleep(max(0.0, min(wait_s, timeout_s)))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import zipfile
@@ -232,25 +234,20 @@ def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole
 
 
 def test_a_killed_camera_is_told_with_its_remedy(console: LiveConsole) -> None:
-    import os
-    import signal
-
-    os.kill(console.station.pids("capture", "back-upper")[0], signal.SIGSTOP)
-    try:
+    def dead() -> bool:
         with console.client("read") as client:
+            cameras = {c["name"]: c for c in client.get("/booth").json()["cameras"]}
+        return cameras["back-upper"]["state"] == "dead" and bool(cameras["back-upper"]["detail"])
 
-            def dead() -> bool:
-                cameras = {c["name"]: c for c in client.get("/booth").json()["cameras"]}
-                return cameras["back-upper"]["state"] == "dead" and bool(
-                    cameras["back-upper"]["detail"]
-                )
-
-            console.station.wait_until(dead, "the stopped camera is told", 20.0)
-    finally:
-        os.kill(console.station.pids("capture", "back-upper")[0], signal.SIGCONT)
-    # Later tests want it back.
     with console.sensors():
-        pass
+        pid = console.station.pids("capture", "back-upper")[0]
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            console.station.wait_until(dead, "the stopped camera is told", 20.0)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        # Later tests want it back.
+        console.start_sensors()
 
 
 def test_the_openapi_document_is_there_without_a_login(console: LiveConsole) -> None:

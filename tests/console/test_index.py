@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import threading
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,8 +18,9 @@ from click.testing import CliRunner
 
 from station.archive.index import FILE, IndexBusyError, ScanIndex
 from station.archive.records import ScanRecord
-from station.booth.retention import purge
+from station.booth.deletion import labelled, purge
 from station.cli import station
+from station.console.api import scans
 from station.console.api.problems import ProblemError
 from station.console.api.scans import _state
 from station.core.config_file import load_config
@@ -136,9 +138,8 @@ def test_all_scans_of_a_label_are_known(spool: Spool) -> None:
     """Deleting by label left what lay beyond the thousandth scan, without a word."""
     for number in range(1100):
         spool.path("failed", f"20261125T100000Z-{number:04d}").mkdir()
-    index = ScanIndex(spool)
-    assert len(index.ids_of("")) == 1100
-    assert index.ids_of("Order 1234") == ["20261121T100000Z-0001"]
+    assert len(labelled(spool, "")) == 1100
+    assert labelled(spool, "Order 1234") == ["20261121T100000Z-0001"]
 
 
 def test_a_locked_index_is_not_thrown_away(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,6 +275,35 @@ def test_the_api_tells_of_a_scan_that_was_never_stored_without_a_station(spool: 
     assert (scan.state, scan.reasons) == ("failed", ["the booth was stopped"])
 
 
+def test_the_api_tells_of_a_scan_whose_result_was_taken_away(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It did not exist while the station ran, and could not be deleted there."""
+    _booth(spool)
+    config = load_config(spool.folder.parent / "booth.toml")
+    audit = SimpleNamespace(note=lambda *words: noted.append(words[2:]))
+    noted: list[Any] = []
+    waiting = SimpleNamespace(status=lambda _: None)
+    told: Any = SimpleNamespace(
+        spool=spool, index=ScanIndex(spool), ledger=Ledger(spool.folder), countdown=waiting,
+        config=config, audit=audit,
+    )  # fmt: skip
+    scan_id = ScanId("20261121T100000Z-0001")
+    spool.notes.write(ScanNote(scan_id, "delivered", label="Order 1234"), durable=False)
+    told.ledger.finish(Waiting("orders", scan_id))
+    shutil.rmtree(spool.path("outbox", scan_id))
+    answer = {"scan_id": scan_id, "state": "delivered", "label": "Order 1234", "reason": "",
+              "framesets": 0, "wanted": 0}  # fmt: skip
+    monkeypatch.setattr(scans, "command", lambda *_: answer)
+    assert _state(told, scan_id).handed_over == ["orders"]
+    manager: Any = SimpleNamespace(name="shop", address="here")
+    assert scans.delete_label("Order 1234", told, manager).handed_over == ["orders"]
+    assert noted == [("delete", scan_id)]
+    for call in (partial(scans.delete, scan_id), partial(scans.delete_label, "Order 1234")):
+        with pytest.raises(ProblemError, match="there is no scan"):
+            call(told, manager)
+
+
 def test_a_scan_that_was_taken_after_all_is_not_said_to_have_failed(spool: Spool) -> None:
     """Control answered the countdown too late, and took the scan."""
     refused = {"state": "failed", "label": "Order 7", "reason": "control did not answer within 5 s",
@@ -394,20 +424,20 @@ def test_copies_are_told_where_the_disk_refuses_to_delete_the_rest(
         spool.path("outbox", name).mkdir()
         write_json(spool.path("outbox", name) / "result.json", {"label": "7", "status": "ok"})
         ledger.finish(Waiting(f"to-{name[-1]}", name))
-    remove, kept = Spool.remove, set[str]()
+    remove, removed = Spool.remove, set[str]()
 
     def refused(self: Spool, path: Path) -> None:
-        if kept and path.name not in kept:
+        if removed and path.name not in removed:
             raise OSError(errno.EIO, "it is broken")
-        kept.add(path.name)
+        removed.add(path.name)
         remove(self, path)
 
     monkeypatch.setattr(Spool, "remove", refused)
     done = CliRunner().invoke(purge, ["--label", "7", *option])
-    [gone] = kept
+    [gone] = removed
     assert done.output.startswith(f"removed {spool.path('outbox', ScanId(gone))}\n")
-    assert done.output.endswith(f"copies handed over to to-{gone[-1]} stay there\n")
-    [left] = {first, second} - kept
+    assert done.output.endswith("copies handed over to to-1, to-2 stay there\n")
+    [left] = {first, second} - removed
     assert ledger.receivers(left) == [f"to-{left[-1]}"]
 
 

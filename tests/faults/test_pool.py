@@ -1,23 +1,32 @@
 """Workers that hang or meet a bad bundle: the scan ends in failed/ with its reason."""
 
+import errno
 import json
+import logging
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from station.booth.retention import FILE, Moment, Removed, expire_old, purge_scans
+from station.booth.deletion import Deleted, purge_scans
+from station.booth.retention import FILE, Moment, expire_old
 from station.core.config import RetentionConfig
+from station.core.config_file import load_config
 from station.core.errors import SpoolError
 from station.core.files import held
 from station.core.scans import REASON, ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
+from workers.reconstruct import pool
 from workers.reconstruct.job_handle import WARM_UP_S
+from workers.reconstruct.pool import Worker
 
 _DAY_S = 86_400.0
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
@@ -66,6 +75,45 @@ def test_a_bad_bundle_fails_once_with_its_reason(
     reason = _serve_until_failed(tmp_path, "torn", "retries = 2")
     assert "000.png is torn" in reason
     assert (tmp_path / "spool/failed/torn/bundle.json").exists()
+
+
+def _idle_worker(spool: Spool, folder: Path) -> Worker:
+    """A worker whose thread was told to stop before it began."""
+    (folder / "booth.toml").write_text(_CAMERA)
+    stop = threading.Event()
+    stop.set()
+    worker = Worker(load_config(folder / "booth.toml"), spool, stop, logging.getLogger())
+    worker.thread.join()
+    return worker
+
+
+def _refuse(*_: object) -> None:
+    raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+
+def test_no_memory_for_the_next_process_ends_no_job(
+    spool: Spool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The job that ran was killed, again and again, and the disk was blamed."""
+    worker = _idle_worker(spool, tmp_path)
+    monkeypatch.setattr(pool, "JobProcess", _refuse)
+    worker._warm_another()
+    with pytest.raises(pool._NoStartError, match=r"no job can be started .*Cannot allocate"):
+        worker._round()
+
+
+def test_nothing_of_an_interrupted_job_stays(spool: Spool, tmp_path: Path) -> None:
+    """Its folder was kept for as long as the workers ran."""
+    worker = _idle_worker(spool, tmp_path)
+    (temporary := spool.temporary("a")).mkdir()
+    spool.submit(temporary, "a")
+    claim = spool.claim()
+    assert claim is not None
+    process: Any = SimpleNamespace(send=lambda *_: None, outcome=_refuse)
+    with pytest.raises(OSError, match="Cannot allocate"):
+        worker._do(claim, process)
+    assert not list((spool.folder / "tmp").iterdir())
+    claim.close()
 
 
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
@@ -146,7 +194,7 @@ def test_nothing_of_a_purged_scan_stays(spool: Spool) -> None:
     (spool.folder / "tmp" / f"{scan_id}5.99.1").mkdir()
     spool.notes.write(ScanNote(scan_id, "delivered", label="Order 1"), durable=True)
     expire_old(spool, RetentionConfig())
-    purge_scans(spool, [scan_id], Removed())
+    purge_scans(spool, [scan_id], Deleted())
     left = [path for path in spool.folder.rglob("*") if scan_id in path.name]
     assert [path.name for path in left] == [f"{scan_id}5.99.1"]
     assert scan_id not in (spool.folder / FILE).read_text()
@@ -156,9 +204,9 @@ def test_a_scan_is_purged_while_old_ones_are_removed(spool: Spool) -> None:
     """It was, and the command ended with an error that promised to retry."""
     spool.path("outbox", "a").mkdir()
     with held(spool.folder / "retention.lock", SpoolError("busy")):
-        removed = Removed()
-        purge_scans(spool, ["a"], removed)
-        assert removed.paths == [spool.path("outbox", "a")]
+        deleted = Deleted()
+        purge_scans(spool, ["a"], deleted)
+        assert deleted.paths == [spool.path("outbox", "a")]
 
 
 def test_a_file_among_what_dead_writers_left_is_removed(spool: Spool) -> None:

@@ -19,8 +19,8 @@ import zmq
 
 from station.archive.compare import compare_surfaces
 from station.archive.surfaces import _FACE
+from station.booth.deletion import Deleted, purge_scans
 from station.booth.health import booth_health
-from station.booth.retention import Removed, purge_scans
 from station.console.live import watch as watch_module
 from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog
@@ -120,7 +120,7 @@ def test_no_distances_of_a_deleted_body_are_kept(watch: tuple[Watch, EventLog]) 
             compare_surfaces(first, second).rms_m < 1e-6 and compare_surfaces.cache_info().hits > 0
         )
     )
-    purge_scans(spool, ["a"], Removed())
+    purge_scans(spool, ["a"], Deleted())
     _until(lambda: compare_surfaces.cache_info().currsize == 0)
 
 

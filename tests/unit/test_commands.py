@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import click
@@ -320,3 +321,10 @@ def test_a_users_error_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith(f"error: {missing} cannot be read")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_command_is_loaded_in_any_thread() -> None:
+    """Only the main thread may change how Ctrl-C is handled: others ended with a ValueError."""
+    with ThreadPoolExecutor(1) as threads:
+        done = threads.submit(CliRunner().invoke, station_cli.station, ["list", "--help"]).result()
+    assert done.exit_code == 0, done.output

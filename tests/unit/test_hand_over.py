@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import os
 import shutil
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from station.archive.records import ScanRecord
-from station.booth.retention import Removed, purge_scans
+from station.booth.deletion import Deleted, purge_scans
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver
-from station.handover.ledger import Ledger, Waiting
+from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from station.handover.targets import HandOverError, make_target
 
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
@@ -98,7 +101,7 @@ def test_a_scan_that_is_deleted_while_it_is_handed_over_waits_for_nobody(tmp_pat
     handover = HandOver(load_config(config), logging.getLogger("deliver"))
 
     def deleted(scan: ScanRecord, result: Path) -> None:
-        purge_scans(spool, [result.name], Removed())
+        purge_scans(spool, [result.name], Deleted())
         if scan.scan_id == _IDS[0]:
             raise HandOverError("it is gone")
 
@@ -126,9 +129,117 @@ def test_who_has_copies_is_known_after_a_result_was_taken_away(tmp_path: Path) -
         shutil.rmtree(spool.folder / "outbox" / name)
     handover.look()
     assert [Ledger(spool.folder).receivers(name) for name in _IDS] == [["share"], []]
-    removed = Removed()
-    purge_scans(spool, [scan_id], removed)
-    assert removed.receivers == {"share"}
+    deleted = Deleted()
+    purge_scans(spool, [scan_id], deleted)
+    assert deleted.receivers == {"share"}
+
+
+@pytest.fixture
+def handover(tmp_path: Path) -> HandOver:
+    """Hand-overs of one result to a folder."""
+    config = tmp_path / "booth.toml"
+    config.write_text(f'{_CAMERA}[[deliver]]\nname = "share"\nfolder = "share"\n')
+    (tmp_path / "share").mkdir()
+    spool = Spool(tmp_path / "spool")
+    _result(spool.folder / "outbox" / _IDS[0], measurements=[])
+    spool.notes.write(ScanNote(ScanId(_IDS[0]), "delivered"), durable=False)
+    return HandOver(load_config(config), logging.getLogger("deliver"))
+
+
+def test_a_result_that_is_taken_away_during_a_try_is_waited_for_no_longer(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """Status told that it would be tried again."""
+
+    def taken(scan: ScanRecord, result: Path) -> None:  # noqa: ARG001
+        shutil.rmtree(result)
+        raise HandOverError("it answers 503")
+
+    handover._targets["share"] = taken
+    handover.look()
+    handover.try_all("share", 1e9)
+    assert Ledger(tmp_path / "spool").waiting() == []
+
+
+def test_a_result_is_not_sent_again_and_again_while_the_disk_refuses(
+    handover: HandOver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A webhook received it four times a second, and status told nothing."""
+    sent, stop = list[str](), threading.Event()
+
+    def received(scan: ScanRecord, result: Path) -> None:  # noqa: ARG001
+        sent.append(scan.scan_id)
+
+    def refused(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no inodes")
+
+    monkeypatch.setattr(Ledger, "finish", refused)
+    handover._targets["share"] = received
+    handover.look()
+    serving = threading.Thread(target=handover._serve, args=("share", stop))
+    serving.start()
+    deadline_s = time.monotonic() + 20.0
+    while not handover.health()["problems"] and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    time.sleep(0.6)
+    stop.set()
+    serving.join()
+    assert sent == [_IDS[0]]
+    assert "no inodes" in handover.health()["problems"][0]
+
+
+def test_a_hand_over_whose_end_was_cut_short_is_not_repeated(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path)
+    ledger.finish(Waiting("share", _IDS[0]))
+    ledger.keep(Waiting("share", _IDS[0]))
+    assert ledger.waiting() == []
+
+
+def test_no_part_of_a_copy_stays_that_was_not_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stayed for ever where the scan was deleted before the next try."""
+    (tmp_path / "share").mkdir()
+    target = make_target(DeliverConfig(name="share", folder=tmp_path / "share"))
+    result = _result(tmp_path / "result", measurements=[])
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("station.handover.targets.fsync_file", full)
+    with pytest.raises(HandOverError, match=r"cannot be written \(No space left"):
+        target(_scan(), result)
+    assert list((tmp_path / "share").iterdir()) == []
+    (result / "mesh.obj").symlink_to("missing")
+    with pytest.raises(HandOverError, match=r"\A[^\n]*written \(\[Errno 2\] No such file[^\n]*\Z"):
+        target(_scan(), result)
+    assert list((tmp_path / "share").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[" * 100_000, '{"tries": Infinity, "next_s": 0, "error": ""}',
+     '{"tries": -100, "next_s": NaN, "error": ""}'],
+)  # fmt: skip
+def test_odd_entries_are_tried_at_once(tmp_path: Path, content: str) -> None:
+    """`station deliver` ended with them at every start."""
+    ledger = Ledger(tmp_path)
+    ledger.keep(Waiting("share", _IDS[0]))
+    (tmp_path / "handover/share/waiting" / f"{_IDS[0]}.json").write_text(content)
+    [entry] = ledger.waiting()
+    assert entry.due(1e9)
+    assert entry.failed("again", 1e9).next_s == 1e9 + PAUSES_S[0]
+
+
+def test_what_is_no_scan_in_the_outbox_is_not_handed_over(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """A name that is no UTF-8, or too long for a record's name, ended the hand-over of all."""
+    outbox = os.fsencode(tmp_path / "spool/outbox")
+    for name in (b"M\xfcller", b"x" * 250):
+        os.mkdir(outbox + b"/" + name)
+    handover.look()
+    assert [entry.scan_id for entry in Ledger(tmp_path / "spool").waiting()] == [_IDS[0]]
 
 
 def test_the_name_of_a_deleted_folder_is_no_pattern(tmp_path: Path) -> None:

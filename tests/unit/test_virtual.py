@@ -9,7 +9,7 @@ import pytest
 import synthetic_calibration as synthetic
 
 from station.core.errors import DriverError, FormatError, InputError
-from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE, depth_m_of_raw
+from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE, depth_m_of_raw, depth_of_raw
 from station.sensors.freenect import FreenectCamera
 from station.sensors.recorded import RecordedCamera
 from station.sensors.recording import check_recording, read_raw, write_recording
@@ -34,6 +34,11 @@ def test_raw_values_and_depths_are_inverse() -> None:
     assert np.array_equal(raw_from_depth(depth_m_of_raw(raw).astype(np.float32)), raw)
     assert TABLE[2047] == 0
     assert TABLE[0] > 0
+
+
+def test_a_frame_of_any_height_is_converted_whatever_its_higher_bits() -> None:
+    raw = np.arange(100 * 41, dtype=np.uint16).reshape(100, 41) * 16
+    assert np.array_equal(depth_of_raw(raw), TABLE[raw % 2048])
 
 
 def test_an_off_centre_ball_stands_where_it_is() -> None:

@@ -14,6 +14,7 @@ import threading
 import time
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,10 @@ class Worker:
     def _round(self) -> bool:
         """Do the next scan; False if none waits."""
         if self._spare is None:
-            self._spare = JobProcess()
+            try:
+                self._spare = JobProcess()
+            except OSError as error:
+                raise _NoStartError(f"no job can be started ({error})") from None
         claim = self._spool.claim()
         if claim is None:
             return False
@@ -110,6 +114,16 @@ class Worker:
 
     def _do(self, claim: Claim, process: JobProcess) -> None:
         out = private_folder(self._spool.temporary(claim.scan_id))
+        try:
+            self._work(claim, process, out)
+        except BaseException:
+            # While this process lives no sweep removes it; a delivery that was begun needs it.
+            with suppress(OSError):
+                if self._spool.note(claim.scan_id).result != out.name:
+                    shutil.rmtree(out)
+            raise
+
+    def _work(self, claim: Claim, process: JobProcess, out: Path) -> None:
         process.send(claim.bundle, out, self._config)
         outcome = process.outcome(self._config.workers.timeout_s, self._stop, self._warm_another)
         if outcome.status:
@@ -124,7 +138,8 @@ class Worker:
 
     def _warm_another(self) -> None:
         """The next job's process warms up while this one works."""
-        self._spare = JobProcess()
+        with suppress(OSError):  # no memory: the next round tries again, this job goes on
+            self._spare = JobProcess()
 
     def _settle(self, claim: Claim, outcome: Outcome) -> None:
         """Settle a scan that ended without a result."""

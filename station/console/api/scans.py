@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 
 from station.archive.records import ScanRecord, ScanState, read_noted
-from station.booth import retention
+from station.booth.deletion import Deleted, NoScanError, forget_labels, labelled, purge_scans
 from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import (
     Booth,
@@ -128,8 +129,14 @@ def _state(console: Console, scan_id: str) -> Scan:
         return of_record(console, noted)
     if found.state not in _ON_DISK:
         return found
-    # On disk by now, or deleted: the folders take precedence over the station's memory.
-    return of_record(console, console.record(scan_id))
+    # On disk by now, taken away, or deleted: the disk takes precedence over the station's memory.
+    return of_record(console, _taken_away(console, scan_id) or console.record(scan_id))
+
+
+def _taken_away(console: Console, scan_id: str) -> ScanRecord | None:
+    """A scan whose result is no longer in the outbox."""
+    scan = scan_id_of(scan_id)
+    return None if console.spool.where(scan) is not None else read_noted(console.spool, scan)
 
 
 @router.post("/{scan_id}/cancel", responses=responses(404, 409))
@@ -144,7 +151,6 @@ def cancel(scan_id: ScanId, console: Booth, caller: Scanner) -> Scan:
 @router.delete("/{scan_id}", responses=responses(404, 409))
 def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
     """Delete a scan, its bundle and its results permanently."""
-    console.record(scan_id)
     return _delete(console, caller, [scan_id])
 
 
@@ -157,18 +163,27 @@ def delete_label(
     caller: Manager,
 ) -> Removed:
     """Delete all scans with exactly this label."""
-    found = console.index.ids_of(label)
+    found = labelled(console.spool, label)
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
     return _delete(console, caller, found)
 
 
-def _delete(console: Console, caller: Caller, scan_ids: list[str]) -> Removed:
-    for scan_id in scan_ids:
-        console.audit.note(caller.name, caller.address, "delete", scan_id)
-    removed = retention.Removed()
-    retention.purge_scans(console.spool, scan_ids, removed)
-    return Removed(scans=scan_ids, handed_over=sorted(removed.receivers))
+def _delete(console: Console, caller: Caller, scan_ids: Sequence[str]) -> Removed:
+    deleted = Deleted()
+    try:
+        purge_scans(console.spool, scan_ids, deleted)
+    except NoScanError as error:
+        raise ProblemError(404, "no-such-scan", str(error)) from None
+    except OSError as error:
+        words = f"{error}; {deleted.copies_words()}" if deleted.receivers else str(error)
+        raise ProblemError(503, "disk", words) from None
+    finally:
+        for scan_id in scan_ids:
+            if any(path.name.split(".")[0] == scan_id for path in deleted.paths):
+                console.audit.note(caller.name, caller.address, "delete", scan_id)
+        forget_labels(console.index)
+    return Removed(scans=list(scan_ids), handed_over=sorted(deleted.receivers))
 
 
 def of_record(console: Console, record: ScanRecord) -> Scan:

@@ -7,6 +7,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import zmq
+
 from station.console.live.control import NotRunningError, RefusedError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
@@ -89,7 +91,8 @@ class ScanCountdown:
                 return
             try:
                 command(self._config, Request("scan", scan_id, waiting.label))
-            except (NotRunningError, RefusedError) as error:
+            except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
+                # Whatever it is: a countdown that does not end keeps all other scans waiting.
                 self._end(scan_id, waiting, str(error))
                 return
             del self._waiting[scan_id]

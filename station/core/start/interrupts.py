@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -15,7 +16,9 @@ def loading() -> Iterator[None]:
     Who ignores Ctrl-C, or handles it, goes on doing so.
     """
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.default_int_handler:
+    # Only the main thread handles signals.
+    mine = threading.current_thread() is threading.main_thread()
+    if before is not signal.default_int_handler or not mine:
         yield
         return
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -13,7 +13,8 @@ import lives
 
 from station.archive.index import ScanIndex
 from station.archive.tables import FILES
-from station.booth.retention import Removed, expire_old, purge_scans, traces
+from station.booth.deletion import Deleted, purge_scans, traces
+from station.booth.retention import expire_old
 from station.core.config import RetentionConfig
 from station.core.files import private_folder
 from station.core.spool import Claim, Spool
@@ -33,7 +34,7 @@ def hand_over(folder: Path) -> None:
     """A hand-over's life: followed, tried in vain, tried again, recorded."""
     spool = Spool(folder / "spool")
     ledger, index = Ledger(spool.folder), ScanIndex(spool)
-    ledger.follow(_TARGET, [found.scan_id for found in index.find()], [])
+    ledger.follow(_TARGET, [found.scan_id for found in index.find()], spool.notes.ids())
     for entry in ledger.waiting():
         _try(ledger, index, spool, entry)
 
@@ -98,7 +99,7 @@ def fail_and_purge(folder: Path) -> None:
         if spool.path("failed", lives.SCAN).exists():
             spool.retry(lives.SCAN)
     expire_old(spool, RetentionConfig())
-    purge_scans(spool, [lives.SCAN], Removed())
+    purge_scans(spool, [lives.SCAN], Deleted())
     ScanIndex(spool).find(limit=0)
 
 
@@ -118,4 +119,4 @@ def nothing_torn(folder: Path) -> bool:
 
 def nothing_left(folder: Path) -> bool:
     """Whether no file bears the scan's name."""
-    return not traces(Spool(folder / "spool"), lives.SCAN)
+    return lives.SCAN not in traces(Spool(folder / "spool"))
