@@ -6,7 +6,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from station.archive.records import ScanRecord
-from station.core.words.terms import TERMS, plain_name, split_side
+from station.core.words.terms import TERMS, plain_name, split_side, verdict_words
 
 VERSION = "0.3.4"
 _NO_SYSTEM = "998"
@@ -22,7 +22,8 @@ def smis(scan: ScanRecord, document: dict[str, Any]) -> bytes:
     name begins with @.
     """
     root = ElementTree.Element("smis")
-    note = f"{scan.label}; {scan.scan_id}; {scan.verdict}; pose {document['pose']}"
+    verdict = verdict_words(scan.verdict, "en")
+    note = f"{scan.label}; {scan.scan_id}; {verdict}; pose {document['pose']}"
     for name, text in (("version", VERSION), ("read-only", "false"), ("notes", note),
                        ("unit", "cm"), ("pm_system", _NO_SYSTEM)):  # fmt: skip
         ElementTree.SubElement(root, name).text = _legal(text)

@@ -36,10 +36,12 @@ import zmq
 from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
 from station.booth.session import (
+    FINAL,
     MAX_LABEL_LENGTH,
     UNSURE,
     Session,
     overdue,
+    plain_label,
     state_of,
 )
 from station.core.commands import config_option
@@ -220,7 +222,11 @@ class ControlProcess:
                 ok=False, error=f"the request for scan {scan_id} expired; no scan was started"
             )
         note = ScanNote(
-            scan_id, "armed", label=request.label, valid_until_s=valid_until_s, boot=boot_id()
+            scan_id,
+            "armed",
+            label=plain_label(request.label),
+            valid_until_s=valid_until_s,
+            boot=boot_id(),
         )
         self._spool.notes.write(note, durable=False)
         self._pass_on(note)
@@ -252,13 +258,14 @@ class ControlProcess:
             return Reply(ok=True, content={**status, "reason": CANCELLED})
         withdrawn = status["state"] == "accepted" and self._spool.withdraw(scan_id, CANCELLED)
         status = self._scan_status(scan_id)
-        if not withdrawn:
-            return Reply(
-                ok=False,
-                error=f"scan {scan_id} can no longer be cancelled (its state is "
-                f"{status['state']}); when it is done, delete it with: station purge {scan_id}",
-            )
-        return Reply(ok=True, content=status)
+        if withdrawn:
+            return Reply(ok=True, content=status)
+        if status["state"] in FINAL:
+            remedy = f"delete it with: station purge {scan_id}"
+        else:
+            remedy = f"when it is done, delete it with: station purge {scan_id}"
+        words = f"scan {scan_id} can no longer be cancelled (its state is {status['state']})"
+        return Reply(ok=False, error=f"{words}; {remedy}")
 
     def _comes_until_s(self, scan_id: ScanId) -> float:
         """Moment until which sync may get a scan's order after its cancel, which overtakes it while

@@ -6,19 +6,18 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import click
 
 from station.archive.index import IndexBusyError, ScanIndex
 from station.archive.records import PLACES, read_record
-from station.booth.retention import expire_old, forget_removed
+from station.booth.retention import Deleted, expire_old, forget_removed
 from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import delete
-from station.core.scans import STATES, ScanId, scan_id_of
+from station.core.scans import STATES, Notes, ScanId, scan_id_of
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
 
@@ -32,26 +31,14 @@ class NoScanError(SpoolError):
     """The spool keeps nothing of a scan."""
 
 
-@dataclass(slots=True)
-class Deleted:
-    """Files and folders that were deleted, also where the disk refused to delete the rest."""
-
-    paths: list[Path] = field(default_factory=list)
-    receivers: set[str] = field(default_factory=set)
-    """Targets that have copies, which stay there."""
-
-    def copies_words(self) -> str:
-        """Sentence about the copies; empty if there are none."""
-        names = ", ".join(sorted(self.receivers))
-        return f"copies handed over to {names} stay there" if names else ""
-
-
 def labelled(spool: Spool, label: str) -> list[ScanId]:
     """Ids of all scans with exactly this label, also of those whose results were taken away.
 
     From the folders themselves: a full disk has no room for the index.
     """
-    noted = ((one, spool.notes.read(one)) for one in spool.notes.ids())
+    # What was there before a backup was restored is kept beside it.
+    before = [Notes(folder) for folder in spool.folder.glob(".scans.before-restore*")]
+    noted = ((one, notes.read(one)) for notes in (spool.notes, *before) for one in notes.ids())
     found = {one for one, note in noted if note is not None and note.label == label}
     for place in PLACES:
         for one in spool.scans_in(place):
@@ -173,7 +160,7 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
     deleted = Deleted()
     try:
         if old:
-            expire_old(spool, config.retention, removed=deleted.paths)
+            expire_old(spool, config.retention, deleted=deleted)
         else:
             scans = [scan_id] if scan_id else [*map(str, labelled(spool, str(label)))]
             if not scans:

@@ -57,6 +57,20 @@ class Ages:
     """"<state>/<scan id>" -> counted time."""
 
 
+@dataclass(slots=True)
+class Deleted:
+    """Files and folders that were deleted, also where the disk refused to delete the rest."""
+
+    paths: list[Path] = field(default_factory=list)
+    receivers: set[str] = field(default_factory=set)
+    """Targets that have copies, which stay there."""
+
+    def copies_words(self) -> str:
+        """Sentence about the copies; empty if there are none."""
+        names = ", ".join(sorted(self.receivers))
+        return f"copies handed over to {names} stay there" if names else ""
+
+
 def advance(ages: Ages, now: Moment) -> Ages:
     """The counted time at a moment (pure)."""
     last = ages.last
@@ -89,11 +103,11 @@ def expire_old(
     retention: RetentionConfig,
     now: Moment | None = None,
     *,
-    removed: list[Path] | None = None,
+    deleted: Deleted | None = None,
 ) -> list[Path]:
     """Remove bundles of delivered scans, results, failed scans and notes that are past their time.
 
-    Returns what was removed. It is added to ``removed``, if given, also where the disk refuses.
+    Returns what was removed. It is added to ``deleted``, if given, also where the disk refuses.
 
     Raises:
         OSError: the disk refuses; what it lets go is removed all the same.
@@ -115,12 +129,11 @@ def expire_old(
         ]
         folders += [f"scans/{scan_id}" for scan_id in spool.notes.ids()]
         ages, old = due(ages, folders, limits_s)
-        removed = [] if removed is None else removed
+        deleted = deleted or Deleted()
         refused: list[OSError] = []
         for name in old:
             try:
-                if _expire(spool, name):
-                    removed.append(spool.folder / name)
+                _expire(spool, name, deleted)
             except FileNotFoundError:
                 continue  # taken away meanwhile
             except OSError as error:
@@ -131,22 +144,25 @@ def expire_old(
         )
     if refused:
         raise refused[0]
-    return removed
+    return deleted.paths
 
 
-def _expire(spool: Spool, name: str) -> bool:
-    """Remove what is past its time; False for a note, which is told with its scan."""
+def _expire(spool: Spool, name: str, deleted: Deleted) -> None:
+    """Remove what is past its time, and tell of it; a note is told with its scan."""
     state, scan_id = name.split("/", 1)
+    ledger = Ledger(spool.folder)
     if state != "scans":
         spool.remove(spool.folder / name)
-        if state == "outbox" and not _exists(spool, f"scans/{scan_id}"):
-            Ledger(spool.folder).forget(scan_id)
-        return True
+        deleted.paths.append(spool.folder / name)
+        if state == "outbox":
+            deleted.receivers.update(ledger.receivers(scan_id))
+            if not _exists(spool, f"scans/{scan_id}"):
+                ledger.forget(scan_id)
+        return
     if spool.where(scan_id) is None and not spool.path("done", scan_id).exists():
         spool.notes.remove(ScanId(scan_id))
         # Its result may have been taken away.
-        Ledger(spool.folder).forget(scan_id)
-    return False
+        ledger.forget(scan_id)
 
 
 def forget_removed(spool: Spool) -> None:

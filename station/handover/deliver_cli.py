@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,10 @@ class HandOver:
         noted = self._spool.notes.ids()
         for section in self._config.deliver:
             wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
-            self._ledger.follow(section.name, wanted, noted)
+            for entry in self._ledger.follow(section.name, wanted, noted):
+                # Whoever took it, or deleted it, may not know who has not received it.
+                words = "scan %s left the outbox before it was handed over to %s"
+                self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
 
     def _serve(self, name: str, stop: threading.Event) -> None:
         while not stop.wait(_POLL_S):
@@ -125,8 +129,13 @@ class HandOver:
         for entry in self._ledger.waiting():
             if entry.target == name and entry.due(now_s):
                 self._round_s[name] = time.monotonic()
-                self._try(entry, now_s)
+                received = self._try(entry, now_s)
                 self._settle(entry)
+                if received:
+                    # The others need not wait as long as after their own failures.
+                    for other in self._ledger.waiting():
+                        if other.target == name and not other.due(now_s):
+                            self._ledger.keep(replace(other, next_s=0.0))
 
     def _settle(self, entry: Waiting) -> None:
         """Wait for no result that is gone: what became of a try was recorded after that."""
@@ -140,24 +149,26 @@ class HandOver:
             self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
         self._ledger.forget(entry.scan_id)
 
-    def _try(self, entry: Waiting, now_s: float) -> None:
+    def _try(self, entry: Waiting, now_s: float) -> bool:
+        """Hand one result over; whether the target has received it."""
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
-            return
+            return False
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
             self._postpone(entry, str(error), now_s)
-            return
+            return False
         except Exception as error:
             # One result that is damaged must not keep the others from being handed over.
             self._log.exception("handing over %s", entry.scan_id, extra={"scan": entry.scan_id})
             self._postpone(entry, f"{type(error).__name__}: {error}", now_s)
-            return
+            return False
         self._ledger.finish(entry)
         self._log.info(
             "%s handed over to %s", entry.scan_id, entry.target, extra={"scan": entry.scan_id}
         )
+        return True
 
     def _postpone(self, entry: Waiting, reason: str, now_s: float) -> None:
         after = entry.failed(reason, now_s)

@@ -51,8 +51,8 @@ class Ledger:
     def __init__(self, spool_folder: Path) -> None:
         self._folder = spool_folder / "handover"
 
-    def follow(self, target: str, scan_ids: Iterable[str], noted: Iterable[str]) -> None:
-        """Add new results; remove what waits of those that no longer exist.
+    def follow(self, target: str, scan_ids: Iterable[str], noted: Iterable[str]) -> list[Waiting]:
+        """Add new results; remove, and return, what waits of those that no longer exist.
 
         ``noted``: scans that are known although their results may have been taken away. Who has
         copies of these is told when they are deleted.
@@ -63,13 +63,16 @@ class Ledger:
         for path in done.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
+        dropped = []
         for path in waiting.glob("*.json"):
             if path.stem not in there:
                 path.unlink(missing_ok=True)
+                dropped.append(Waiting(target, path.stem))
         for scan_id in there:
             # In this order: `finish` ends the waiting after it has recorded the hand-over.
             if not (waiting / f"{scan_id}.json").exists() and not (done / scan_id).exists():
                 self.keep(Waiting(target, scan_id))
+        return dropped
 
     def keep(self, entry: Waiting) -> None:
         """Save a waiting result."""

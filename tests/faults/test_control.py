@@ -14,7 +14,7 @@ from station.booth.control import ControlProcess
 from station.booth.session import UNSURE
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
-from station.core.scans import Notes
+from station.core.scans import Notes, ScanId, ScanNote
 from station.messaging.messages import Request
 
 _ORDER = Request("scan", "a", "", 1e9)
@@ -63,3 +63,23 @@ def test_a_label_that_no_note_holds_is_refused(control: ControlProcess) -> None:
     assert not reply.ok
     assert "the label has 10000 characters" in reply.error
     assert not list((control._spool.folder / "scans").iterdir())
+
+
+def test_a_label_is_kept_as_lists_show_it(control: ControlProcess) -> None:
+    """Two that looked the same were two, and one of blanks looked like a scan of nobody."""
+    for scan_id, label in (("a", " a\tb\x07\n"), ("b", "   "), ("c", "👩\u200d👧 李")):
+        assert control._reply(Request("scan", scan_id, label, 1e9)).ok
+    notes = [control._spool.notes.read(scan_id) for scan_id in control._spool.notes.ids()]
+    assert [note and note.label for note in notes] == ["a b", "", "👩\u200d👧 李"]
+
+
+def test_a_cancel_that_comes_too_late_says_what_to_do_now(control: ControlProcess) -> None:
+    """A delivered scan was to be deleted when it is done."""
+    for stage in ("delivered", "accepted"):
+        note = ScanNote(ScanId("a"), stage)
+        control._spool.notes.write(note, durable=False)
+        if stage == "accepted":
+            (control._spool.path("work", "a")).mkdir()
+        error = control._reply(Request("cancel", "a")).error
+        assert "can no longer be cancelled" in error
+        assert ("when it is done" in error) == (stage == "accepted")

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from station.booth.deletion import Deleted, purge_scans
-from station.booth.retention import FILE, Moment, expire_old
+from station.booth.deletion import purge_scans
+from station.booth.retention import FILE, Deleted, Moment, expire_old
 from station.core.config import RetentionConfig
 from station.core.config_file import load_config
 from station.core.errors import SpoolError

@@ -19,8 +19,9 @@ import zmq
 
 from station.archive.compare import compare_surfaces
 from station.archive.surfaces import _FACE
-from station.booth.deletion import Deleted, purge_scans
+from station.booth.deletion import purge_scans
 from station.booth.health import booth_health
+from station.booth.retention import Deleted
 from station.console.live import watch as watch_module
 from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog

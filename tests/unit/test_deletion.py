@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from station.archive.index import ScanIndex
-from station.booth.deletion import Deleted, NoScanError, forget_labels, labelled, purge_scans
-from station.booth.retention import FILE, Moment, expire_old
+from station.booth.deletion import NoScanError, forget_labels, labelled, purge_scans
+from station.booth.retention import FILE, Deleted, Moment, expire_old
 from station.core.config import RetentionConfig
 from station.core.files import write_json
 from station.core.scans import ScanId, ScanNote
@@ -48,6 +48,16 @@ def test_a_label_is_also_that_of_results_that_were_taken_away(spool: Spool) -> N
     left = [path for path in spool.folder.rglob("*") if path.name.startswith("20261121")]
     assert left == []
     assert spool.notes.ids() == ["other"]
+
+
+def test_a_label_is_also_that_of_what_a_restored_backup_replaced(spool: Spool) -> None:
+    (spool.folder / "scans").rename(spool.folder / ".scans.before-restore")
+    (spool.folder / "done").rename(spool.folder / ".done.before-restore")
+    spool = Spool(spool.folder)
+    found = labelled(spool, "Order 9")
+    assert found == [_ONE, _TWO, _THREE]
+    purge_scans(spool, found, Deleted())
+    assert [path for path in spool.folder.rglob("*") if path.name.startswith("20261121")] == []
 
 
 def test_no_worker_takes_a_scan_whose_label_is_being_deleted(
@@ -113,7 +123,9 @@ def test_receivers_are_known_as_long_as_anything_of_a_scan_is(spool: Spool) -> N
     retention, start = RetentionConfig(raw_days=7, result_days=1), Moment(1.8e9, 100.0, "boot")
     expire_old(spool, retention, start)
     assert ledger.receivers("20250101T000000Z-0000") == []
-    expire_old(spool, retention, Moment(1.8e9, 100.0 + 2 * _DAY_S, "boot"))
+    deleted = Deleted()
+    expire_old(spool, retention, Moment(1.8e9, 100.0 + 2 * _DAY_S, "boot"), deleted=deleted)
+    assert deleted.copies_words() == "copies handed over to share stay there"
     assert not spool.path("outbox", _ONE).exists()
     assert ledger.receivers(_ONE) == ["share"]
     deleted = Deleted()

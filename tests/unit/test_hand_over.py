@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from station.archive.records import ScanRecord
-from station.booth.deletion import Deleted, purge_scans
+from station.booth.deletion import purge_scans
+from station.booth.retention import Deleted
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.scans import ScanId, ScanNote
@@ -214,6 +215,29 @@ def test_no_part_of_a_copy_stays_that_was_not_finished(
     with pytest.raises(HandOverError, match=r"\A[^\n]*written \(\[Errno 2\] No such file[^\n]*\Z"):
         target(_scan(), result)
     assert list((tmp_path / "share").iterdir()) == []
+
+
+def test_a_share_that_is_back_gets_at_once_what_waits_for_it(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """It was said for minutes that it does not exist, while it received new results."""
+    ledger = Ledger(tmp_path / "spool")
+    _result(tmp_path / "spool/outbox" / _IDS[1], measurements=[])
+    handover.look()
+    ledger.keep(Waiting("share", _IDS[1], tries=5, next_s=1e9 + 300.0, error="does not exist"))
+    handover.try_all("share", 1e9)
+    handover.try_all("share", 1e9)
+    assert ledger.waiting() == []
+    assert {path.name for path in (tmp_path / "share").iterdir()} == set(_IDS)
+
+
+def test_a_result_that_leaves_before_it_is_handed_over_is_told(
+    handover: HandOver, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    handover.look()
+    shutil.rmtree(tmp_path / "spool/outbox" / _IDS[0])
+    handover.look()
+    assert f"scan {_IDS[0]} left the outbox before it was handed over to share" in caplog.text
 
 
 @pytest.mark.parametrize(

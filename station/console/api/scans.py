@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query
 
 from station.archive.records import ScanRecord, ScanState, read_noted
-from station.booth.deletion import Deleted, NoScanError, forget_labels, labelled, purge_scans
+from station.booth.deletion import NoScanError, forget_labels, labelled, purge_scans
+from station.booth.retention import Deleted
 from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import (
     Booth,

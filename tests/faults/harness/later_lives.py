@@ -13,8 +13,8 @@ import lives
 
 from station.archive.index import ScanIndex
 from station.archive.tables import FILES
-from station.booth.deletion import Deleted, purge_scans, traces
-from station.booth.retention import expire_old
+from station.booth.deletion import purge_scans, traces
+from station.booth.retention import Deleted, expire_old
 from station.core.config import RetentionConfig
 from station.core.files import private_folder
 from station.core.spool import Claim, Spool
