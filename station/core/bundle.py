@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import shutil
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.png import image_of_png, png_of, png_size
-from station.core.errors import BundleError, CalibrationError
+from station.core.errors import BundleError, BundleReadError, CalibrationError
 from station.core.files import private_folder, read_json, read_regular, write_json
 from station.core.rig import Rig
 
@@ -24,6 +25,8 @@ VERSIONS = frozenset({1})
 MANIFEST = "bundle.json"
 CALIBRATION = "calibration.json"
 _ENCODERS = 2
+_OF_THE_DISK = (errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Reasons that are no file's own and may pass."""
 _PNG_SLACK_BYTES = 1 << 16
 """Allowance beyond twice the pixels' own size, which not even a PNG of noise reaches."""
 MAX_CAMERAS, MAX_FRAMES = 64, 1000
@@ -70,6 +73,7 @@ class Bundle:
 
         Raises:
             BundleError: the file is missing, torn, or not a 16-bit image of the camera's size.
+            BundleReadError: the disk refuses.
         """
         path = self.folder / record.file
         # Only links of the bundle itself: the spool may well lie behind one.
@@ -82,7 +86,8 @@ class Bundle:
         try:
             data = read_regular(path, most_bytes)
         except OSError as cause:
-            raise BundleError(f"{path} cannot be read ({cause.strerror}); scan again") from None
+            kind = BundleReadError if cause.errno in _OF_THE_DISK else BundleError
+            raise kind(f"{path} cannot be read ({cause.strerror}); scan again") from None
         except ValueError as cause:
             raise BundleError(f"{path} {cause}; scan again") from None
         # Checked before decoding: a small file may claim to be an image of gigabytes.

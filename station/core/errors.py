@@ -23,6 +23,10 @@ class BundleError(FormatError):
     """A scan bundle is incomplete or contradicts itself."""
 
 
+class BundleReadError(BundleError):
+    """The disk refused to read a bundle, which says nothing of the scan: it may read it later."""
+
+
 class CalibrationError(BoothError):
     """The calibration is missing, stale or cannot be computed from what was seen."""
 

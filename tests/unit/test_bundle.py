@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import struct
@@ -8,7 +9,7 @@ import pytest
 
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
 from station.core.depth.correction import DepthCorrection
-from station.core.errors import BundleError, CalibrationError, FormatError
+from station.core.errors import BundleError, BundleReadError, CalibrationError, FormatError
 from station.core.rig import CameraCalibration, Rig
 
 
@@ -60,6 +61,25 @@ def test_a_torn_frame_is_named(bundle_folder: Path, length: int) -> None:
     path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(BundleError, match=r"001\.png is torn"):
         read_bundle(bundle_folder).depth_stack("front")
+
+
+@pytest.mark.parametrize(
+    ("number", "of_the_disk"), [(errno.EIO, True), (errno.EMFILE, True), (errno.ENOTDIR, False)]
+)
+def test_a_disk_that_refuses_is_not_the_scans_fault(
+    bundle_folder: Path, monkeypatch: pytest.MonkeyPatch, number: int, of_the_disk: bool
+) -> None:
+    """A passing error of the disk failed a scan for good, whose person had left."""
+    bundle = read_bundle(bundle_folder)
+    camera, frames = next(iter(bundle.frames.items()))
+
+    def refused(*_: object) -> bytes:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("station.core.bundle.read_regular", refused)
+    with pytest.raises(BundleError, match="cannot be read") as raised:
+        bundle.read_frame(camera, frames[0])
+    assert isinstance(raised.value, BundleReadError) == of_the_disk
 
 
 def test_a_missing_frame_is_named(bundle_folder: Path) -> None:
