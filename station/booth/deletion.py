@@ -61,6 +61,7 @@ def purge_scans(spool: Spool, scan_ids: Sequence[str], deleted: Deleted) -> None
     queued = [one for one in ids if spool.path("queue", one).exists()]
     others = [one for one in ids if one not in queued]
     with ExitStack() as held:
+        held.callback(forget_removed, spool)
         # A worker would take these meanwhile. Not all others as well: a label may have more scans
         # than a process may open files.
         listed = traces(spool)
@@ -70,10 +71,9 @@ def purge_scans(spool: Spool, scan_ids: Sequence[str], deleted: Deleted) -> None
                 pass
         for one, paths in found.items():
             _purge(spool, one, paths, deleted)
-    for one in others:
-        with suppress(NoScanError), _removable(spool, one, listed) as paths:
-            _purge(spool, one, paths, deleted)
-    forget_removed(spool)
+        for one in others:
+            with suppress(NoScanError), _removable(spool, one, listed) as paths:
+                _purge(spool, one, paths, deleted)
 
 
 def forget_labels(index: ScanIndex) -> None:
