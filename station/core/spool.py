@@ -12,6 +12,7 @@ import fcntl
 import logging
 import os
 import shutil
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -249,7 +250,8 @@ def _writer_lives(name: str) -> bool:
         started = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
     except (OSError, ValueError, IndexError):
         return False
-    return started / os.sysconf("SC_CLK_TCK") <= int(made_ns) / 1e9
+    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return started / os.sysconf("SC_CLK_TCK") <= int(made_ns) / 1e9 <= now_s
 
 
 class Claim:

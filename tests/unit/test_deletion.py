@@ -198,9 +198,10 @@ def test_ages_that_cannot_be_read_just_now_are_kept(
 def test_leftovers_of_an_earlier_boot_are_removed(spool: Spool) -> None:
     """A process that has the number of their writer by now kept them for ever."""
     tmp = spool.folder / "tmp"
-    mine, others = spool.temporary(_ONE), tmp / f"{_TWO}.{os.getpid()}.1"
+    mine = spool.temporary(_ONE)
+    others = [tmp / f"{_TWO}.{os.getpid()}.{made_ns}" for made_ns in (1, 10**18)]
     old = spool.folder / ".retention.json.1234.tmp"
-    for path in (mine, others):
+    for path in (mine, *others):
         path.mkdir()
     for path in (old, spool.folder / ".now.tmp"):
         path.write_text(_ONE)
