@@ -182,9 +182,22 @@ def test_abandoned_calibrations_are_listed(config: Path, store: CalibrationStore
     assert [line.split()[0] for line in lines] == [f"abandoned-{n}" for n in range(1, 11)]
 
 
-@pytest.mark.parametrize(("balls", "kept"), [(0, "nothing was recorded"), (1, "what was seen is")])
+@pytest.mark.parametrize(
+    ("balls", "again", "kept"),
+    [
+        (0, False, "nothing was recorded"),
+        (1, False, "what was seen is"),
+        (1, True, "nothing replaces what was seen of the ball before"),
+    ],
+)
 def test_a_step_that_is_stopped_says_what_is_kept(
-    config: Path, store: CalibrationStore, monkeypatch: pytest.MonkeyPatch, balls: int, kept: str
+    config: Path,
+    store: CalibrationStore,
+    monkeypatch: pytest.MonkeyPatch,
+    balls: int,
+    kept: str,
+    *,
+    again: bool,
 ) -> None:
     """The page, and the command once a step had begun, spoke of what was seen where nothing was."""
 
@@ -193,6 +206,8 @@ def test_a_step_that_is_stopped_says_what_is_kept(
 
     session = _begin(store)
     session.record_balls(balls * [ball(next(iter(CAMERAS)), 0.0)])
+    if again:
+        session.begin_run(again=True)
     monkeypatch.setattr(Procedure, "empty", stopped)
     with pytest.raises(CalibrationError, match=f"stopped; {kept}"):
         guided.run(config, "floor", new=False)

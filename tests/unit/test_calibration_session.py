@@ -61,18 +61,29 @@ def test_the_ball_waved_anew_replaces_the_old_one_in_one_line(tmp_path: Path) ->
     session.record_balls([ball("front-lower", 1.0), ball("front-lower", 2.0)])
     path = tmp_path / JOURNAL
     before = path.read_bytes()
-    session.begin_run()
+    session.end_replay("a recording")
+    session.begin_run(again=True)
     begun = path.read_bytes()
-    session.record_balls([ball("front-upper", 7.0)], again=True)
-    session.record_balls([ball("front-upper", 8.0)])
+    session.replace_balls(
+        [[ball("front-upper", 7.0), ball("front-upper", 8.0)], [ball("front-lower", 3.0)]]
+    )
     whole = path.read_bytes()
-    assert [ball.time_s for ball in Session.load(tmp_path).balls] == [7.0, 8.0]
+    anew = Session.load(tmp_path)
+    # Two runs of it, whose clocks have nothing in common.
+    assert [ball.time_s for ball in anew.balls] == [7.0, 8.0, 18.0]
+    assert not anew.replayed
     for end in range(len(begun), len(whole)):
         path.write_bytes(whole[:end])
-        assert Session.load(tmp_path).balls
+        stopped = Session.load(tmp_path)
+        assert [ball.time_s for ball in stopped.balls] == [1.0, 2.0]
+        assert stopped.replayed == "a recording"
+        assert stopped.replacing
     # As earlier versions wrote it.
     path.write_bytes(before + b'{"step":"forget-balls"}\n')
     assert Session.load(tmp_path).balls == []
+    one = json.dumps(ball("front-upper", 7.0).to_json())
+    path.write_bytes(before + f'{{"step":"ball-again","balls":[{one}]}}\n'.encode())
+    assert [ball.time_s for ball in Session.load(tmp_path).balls] == [7.0]
 
 
 def test_a_line_that_is_being_written_is_left_alone(tmp_path: Path) -> None:

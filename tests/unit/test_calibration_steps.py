@@ -14,7 +14,7 @@ from seen_balls import ball
 
 from station.calibration.detect.detections import BallDetection
 from station.calibration.detect.swing import LOOK_S, whole_swings
-from station.calibration.guide import finder
+from station.calibration.guide import finder, steps
 from station.calibration.guide.feed import Feed, TimedFrame
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
@@ -110,6 +110,42 @@ def test_what_was_seen_before_is_kept_until_it_is_seen_again(
     guide = Guide(attended=False, countdown_s=0.0)
     wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0, again=True)
     assert len(Session.load(tmp_path).balls) == (40 if again_seen else 7)
+
+
+@pytest.mark.parametrize("reset_at", [10, 20])
+def test_a_second_attempt_that_is_stopped_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reset_at: int
+) -> None:
+    """Its first second replaced a complete first attempt; the step was no longer done."""
+
+    class Stopped(_Frames):
+        def newest(self) -> list[TimedFrame]:
+            if self._next == 19:
+                raise KeyboardInterrupt
+            return super().newest()
+
+    monkeypatch.setattr(steps, "_WRITE_EVERY_S", 0.0)
+    monkeypatch.setattr(finder, "find_ball", lambda *args, **_: ball(args[1].name, args[3]))
+    rig = default_rig().cameras
+    session = Session.begin(tmp_path, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    session.begin_run()
+    session.record_balls([ball(_CAMERAS[0], 0.1 * number) for number in range(7)])
+    session.end_replay("a recording")
+    guide = Guide(attended=False, countdown_s=0.0)
+
+    def wave(feed: _Frames) -> None:
+        frames = cast(Feed, feed)
+        wave_ball(frames, session, guide, reference="front-upper", lasts_s=1.0, again=True)
+
+    with pytest.raises(KeyboardInterrupt):
+        wave(Stopped(moments=20, reset_at=reset_at))
+    kept = Session.load(tmp_path)
+    assert (len(kept.balls), kept.replayed) == (7, "a recording")
+    assert kept.replacing
+    wave(_Frames(moments=20, reset_at=reset_at))
+    seen = Session.load(tmp_path)
+    assert len(seen.balls) == 40
+    assert not seen.replacing
 
 
 def test_an_operator_is_told_when_what_he_sees_lags(

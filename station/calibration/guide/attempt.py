@@ -79,6 +79,8 @@ class Attempt:
     def kept(self) -> str:
         """Words on what is left of a step that was stopped."""
         session = self.unfinished_session()
+        if session is not None and session.replacing:
+            return "nothing replaces what was seen of the ball before, which is kept"
         seen = session is not None and session.anything
         return "what was seen is kept" if seen else "nothing was recorded"
 

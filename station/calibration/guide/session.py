@@ -1,9 +1,10 @@
 """A calibration that is being done: what is seen is put on disk as it comes, and read again.
 
 A folder with ``session.json``, ``sensors.json`` (the cameras as they come from the factory),
-``observations.jsonl`` (one line for each finished step, one a second while the ball is waved) and
-``scene/<camera>.npz`` (the empty booth). A line is whole or, after a crash, cut off at the next
-start; the operator goes on where it ended.
+``observations.jsonl`` (one line for each finished step, one a second while the ball is waved, and
+one for all of it where it replaces what was seen before) and ``scene/<camera>.npz`` (the empty
+booth). A line is whole or, after a crash, cut off at the next start; the operator goes on where it
+ended.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ JOURNAL, SCENE = "observations.jsonl", "scene"
 Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
 _FORGET_RAISED, _REPLAYED, _BALL_AGAIN = "forget-raised", "ball-replayed", "ball-again"
+_RUN, _RUN_AGAIN = "run", "run-again"
 _FORGET_BALLS = "forget-balls"
 """Entry of earlier versions, which forgot the waved ball before it was seen anew."""
 _NO_ENTRY = (
@@ -62,6 +64,8 @@ class Session(Seen):
     runs: int = 0
     replayed: str = ""
     """Fingerprint of the recording of the waved ball that was looked at to its end."""
+    replacing: bool = False
+    """The ball is being waved anew, or this was stopped: nothing is replaced yet."""
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
 
@@ -137,16 +141,21 @@ class Session(Seen):
         """The ball on the mark (MARK), in front of it (FRONT) or elsewhere ("around-0", ...)."""
         self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
 
-    def begin_run(self) -> None:
-        """Start another run of waving, whose times are unrelated to those before."""
-        self._append({"step": "run"})
+    def begin_run(self, *, again: bool = False) -> None:
+        """Start another run of waving, whose times are unrelated to those before; ``again``: it is
+        to replace them."""
+        self._append({"step": _RUN_AGAIN if again else _RUN})
 
-    def record_balls(self, balls: Sequence[BallDetection], *, again: bool = False) -> None:
-        """The waved ball, since the last call; ``again``: in place of all that was seen of it, as
-        one line, so that nothing is lost before there is something new."""
+    def record_balls(self, balls: Sequence[BallDetection]) -> None:
+        """The waved ball, since the last call."""
         if balls:
-            step = _BALL_AGAIN if again else BALL
-            self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
+            self._append({"step": BALL, "balls": [ball.to_json() for ball in balls]})
+
+    def replace_balls(self, runs: Sequence[Sequence[BallDetection]]) -> None:
+        """The ball waved anew, in place of all that was seen of it: one line, so that there is
+        always one or the other, and whole."""
+        seen = [{"balls": [ball.to_json() for ball in run]} for run in runs]
+        self._append({"step": _BALL_AGAIN, "runs": seen})
 
     def end_replay(self, recording: str) -> None:
         """A recording (its fingerprint) of the waved ball was looked at to its end: it shows
@@ -198,10 +207,13 @@ class Session(Seen):
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         step = str(entry["step"])
-        if step == "run":
+        self.replacing = step == _RUN_AGAIN
+        if step == _RUN:
             self.runs += 1
             self._later_s = None
             self.replayed = ""
+        elif step == _RUN_AGAIN:
+            self.runs += 1
         elif step == _REPLAYED:
             self.replayed = str(entry["recording"])
         elif step == _FORGET_BALLS:
@@ -212,14 +224,16 @@ class Session(Seen):
                 raise ValueError("places are a list")
             for place in entry["places"]:
                 self.around.pop(str(place), None)
-        elif step in (BALL, _BALL_AGAIN):
-            seen = self._balls(entry)
-            if step == _BALL_AGAIN:
-                self.balls.clear()
-                self.replayed = ""
+        elif step == BALL:
+            self._take_run(self._balls(entry))
+        elif step == _BALL_AGAIN:
+            # Earlier versions wrote the first second of a single run.
+            runs = [self._balls(run) for run in entry.get("runs", [entry])]
+            self.balls.clear()
+            self.replayed = ""
+            for run in runs:
                 self._later_s = None
-            later_s = self._moved_by(min(ball.time_s for ball in seen))
-            self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
+                self._take_run(run)
         elif step in (MARK, FRONT):
             setattr(self, step, self._balls(entry))
         elif kind_of(step) in PLACES:
@@ -237,6 +251,10 @@ class Session(Seen):
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
+
+    def _take_run(self, seen: Sequence[BallDetection]) -> None:
+        later_s = self._moved_by(min(ball.time_s for ball in seen))
+        self.balls += [replace(ball, time_s=ball.time_s + later_s) for ball in seen]
 
     def _balls(self, entry: Mapping[str, Any]) -> list[BallDetection]:
         return self._known([BallDetection.from_json(ball) for ball in entry["balls"]])

@@ -235,15 +235,15 @@ def wave_ball(
 ) -> None:
     """Keep the ball on its way through the booth, until the time is over and it is enough.
 
-    What was seen is on disk within a second, whatever ends the step. Seconds in which the ball was
-    seen before count; ``again``: all that was seen before is forgotten once it is seen anew.
+    What was seen is on disk within a second, whatever ends the step, and seconds in which the ball
+    was seen before count. ``again``: it replaces all that was seen before, once it is complete.
     """
     if again:
         coverage = Coverage(session.lensed_cameras(), reference, session.radius_m)
     else:
         coverage = coverage_so_far(session, reference)
         lasts_s = max(lasts_s - session.waved_s, _LEAST_WAVED * lasts_s)
-    session.begin_run()
+    session.begin_run(again=again)
     resets: dict[str, int] = {}
     waved = _Waved(session, coverage, again)
     began_s = written_s = time.monotonic()
@@ -255,8 +255,7 @@ def wave_ball(
                         # What follows cannot be put in time with what went before, of which some
                         # is still being looked at.
                         waved.keep(finder.found(wait=True))
-                        waved.write()
-                        session.begin_run()
+                        waved.begin_run()
                         resets[frame.camera] = frame.clock_resets
                     finder.submit([frame])
                 waved.keep(finder.found())
@@ -276,7 +275,7 @@ def wave_ball(
                 time.sleep(_LOOK_EVERY_S)
         finally:
             waved.write()
-    _tell_waved(coverage, guide, replaced=not waved.again)
+    _tell_waved(coverage, guide, replaced=waved.replace_earlier() or not again)
 
 
 @dataclass(slots=True)
@@ -286,20 +285,38 @@ class _Waved:
     session: Session
     coverage: Coverage
     again: bool
-    """Earlier detections are to be forgotten, and are there still."""
-    waiting: list[BallDetection] = field(default_factory=list)
+    """They replace earlier ones, which a step that is stopped must not cost: none is written
+    before all are there."""
+    runs: list[list[BallDetection]] = field(default_factory=lambda: [[]])
+    """What is not on disk yet; the last run goes on."""
 
     def keep(self, balls: list[BallDetection]) -> None:
         for ball in balls:
             self.coverage.add(ball)
-        self.waiting.extend(balls)
+        self.runs[-1].extend(balls)
 
     def write(self) -> None:
+        if self.again:
+            return
         # Emptied first: whatever interrupts the writing, nothing is written twice.
-        seen = list(self.waiting)
-        self.waiting.clear()
-        self.session.record_balls(seen, again=self.again)
-        self.again = self.again and not seen
+        seen = list(self.runs[-1])
+        self.runs[-1].clear()
+        self.session.record_balls(seen)
+
+    def begin_run(self) -> None:
+        if self.again:
+            self.runs.append([])
+        else:
+            self.write()
+            self.session.begin_run()
+
+    def replace_earlier(self) -> bool:
+        """Put what was seen anew in place of what was seen before; false where there is nothing."""
+        runs = [run for run in self.runs if run]
+        if not self.again or not runs:
+            return False
+        self.session.replace_balls(runs)
+        return True
 
 
 def _tell_waved(coverage: Coverage, guide: Guide, *, replaced: bool) -> None:
