@@ -99,6 +99,25 @@ def test_a_cancelled_scan_does_not_count_as_failed(
     _until(lambda: counts() == (1, 1, 2))
 
 
+@pytest.mark.parametrize(
+    ("driver", "remedy"),
+    [
+        ('"recorded"\nrecording = "a"', "check the recording"),
+        ('"freenect"\nserial = "A1"', "unplug the camera's USB cable for five seconds"),
+    ],
+)
+def test_the_remedy_for_a_dead_camera_is_one_it_can_have(
+    tmp_path: Path, driver: str, remedy: str
+) -> None:
+    """A recording was to be unplugged."""
+    path = tmp_path / "booth.toml"
+    path.write_text(f'[[cameras]]\nname = "a"\ndriver = {driver}\n')
+    watching = Watch(load_config(path), EventLog(), logging.getLogger())
+    watching._set_dead(watching._cameras["a"])
+    told = watching.booth()["cameras"][0]["detail"]
+    assert told.endswith(f"restarted automatically; if this persists, {remedy}")
+
+
 def _small_body(result: Path) -> Path:
     """A result with a mesh of a small sphere."""
     result.mkdir()

@@ -187,9 +187,13 @@ class Watch:
         if camera.state == "dead":
             return  # told already: it hung, and was killed for it
         camera.state = "dead"
+        remedy = (
+            "if this persists, check the recording"
+            if camera.name in self._config.recorded
+            else "if this persists, unplug the camera's USB cable for five seconds"
+        )
         camera.detail = (
-            "its capture process is not responding and is restarted automatically; if "
-            "this persists, unplug the camera's USB cable for five seconds"
+            f"its capture process is not responding and is restarted automatically; {remedy}"
         )
         self._events.append("camera", camera.document())
 
