@@ -112,7 +112,7 @@ def _sentences(path: Path) -> list[str]:
 
 
 def _ends_of_sentences(path: Path) -> list[str]:
-    """What is put before or behind a sentence."""
+    """Words that are put before or behind a sentence."""
     found = [text for text in _templates(path) if text != text.strip()]
     return [text.strip(" \n;:,") for text in found if len(WORD.findall(text)) >= _MIN_WORDS]
 

@@ -294,7 +294,7 @@ class _Waved:
     """They replace earlier ones, which a step that is stopped must not cost: none is written
     before all are there."""
     runs: list[list[BallDetection]] = field(default_factory=lambda: [[]])
-    """What is not on disk yet; the last run goes on."""
+    """Detections that are not on disk yet; the last run goes on."""
 
     def keep(self, balls: list[BallDetection]) -> None:
         for ball in balls:
