@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
 from live_console import LiveConsole
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import UNFINISHED
@@ -128,6 +128,40 @@ def test_copies_that_stay_are_told_before_a_scan_is_deleted(
                 dialog.get_by_role("button", name="Cancel").click()
         finally:
             ledger.forget(scan_id)
+
+
+def test_a_table_that_does_not_come_moves_no_switch(
+    console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    """Centimetres stood under "in", and the lines of one pose beside the numbers of another."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, f"result/{scans[0]['scan_id']}")
+        inches = page.get_by_role("button", name="in", exact=True)
+        standard = page.get_by_role("button", name="Standard pose")
+        waist = page.locator("tr[data-name=waist_girth] b")
+        expect(inches).to_have_attribute("aria-pressed", "false", timeout=LONG_MS)
+        before = waist.inner_text()
+        page.route("**/measurements?*", lambda route: route.abort())
+        for count, switch in ((1, inches), (2, standard)):
+            switch.click()
+            expect(page.locator(".notice.bad")).to_have_count(count, timeout=LONG_MS)
+            expect(switch).to_have_attribute("aria-pressed", "false")
+        expect(waist).to_have_text(before)
+        assert page.evaluate("localStorage.length") == 0
+        page.unroute("**/measurements?*")
+        # The answer to the first tap comes after the second tap's.
+        held: list[Route] = []
+        page.route("**/measurements?*unit=in*", lambda route: held.append(route), times=1)
+        inches.click()
+        standard.click()
+        expect(standard).to_have_attribute("aria-pressed", "true", timeout=LONG_MS)
+        expect(inches).to_have_attribute("aria-pressed", "true")
+        held[0].continue_()
+        page.get_by_role("button", name="As scanned").click()
+        expect(standard).to_have_attribute("aria-pressed", "false", timeout=LONG_MS)
+        assert float(waist.inner_text()) == pytest.approx(float(before) / 2.54, abs=0.03)
 
 
 def test_another_language_says_the_same(console: LiveConsole) -> None:

@@ -1,10 +1,11 @@
 // Two scans: where the bodies differ in colours, and which measurements really do.
 
 import { bytes, get } from './api.js';
-import { h, notice, segmented } from './dom.js';
+import { h } from './dom.js';
 import { currentLanguage, t, time } from './i18n.js';
 import { readPly } from './ply.js';
-import { choose, digits, settings } from './settings.js';
+import { digits } from './settings.js';
+import { switches } from './switches.js';
 
 const FULL_COLOUR_M = 0.02;
 
@@ -18,8 +19,7 @@ export async function compare(main, session, first, second) {
   const who = h('div', { className: 'small soft' });
   const surface = h('span', { className: 'small soft' });
 
-  async function table() {
-    const found = await get(`${path}/comparison/${second}?pose=${settings.pose}&unit=${settings.unit}&language=${currentLanguage()}`);
+  const table = switches(({ pose, unit }) => get(`${path}/comparison/${second}?pose=${pose}&unit=${unit}&language=${currentLanguage()}`), (found) => {
     const name = (scan) => `${scan.label || t('result.noLabel')}, ${time(scan.created)}`;
     who.replaceChildren(h('div', {}, t('compare.first', { name: name(found.first) })), h('div', {}, t('compare.second', { name: name(found.second) })));
     head.replaceChildren(h('th', {}, t('result.name')), ...['one', 'two', 'difference'].map((word) => h('th', { className: 'number' }, t(`compare.${word}`))));
@@ -31,7 +31,7 @@ export async function compare(main, session, first, second) {
         h('td', { className: look }, signed(row.difference), h('span', { className: 'small soft' }, ` ± ${row.uncertainty.toFixed(digits())}`)));
     }));
     surface.textContent = t('compare.surface', { rms: (1e3 * found.surface_rms_m).toFixed(1), p95: (1e3 * found.surface_p95_m).toFixed(1) });
-  }
+  });
 
   async function show3d() {
     try {
@@ -50,7 +50,6 @@ export async function compare(main, session, first, second) {
     }
   }
 
-  const change = (name) => (value) => { choose(name, value); table().catch((error) => notice(error.message, true)); };
   main.replaceChildren(
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, t('compare.title')), who), h('span', { className: 'grow' }),
       h('a', { className: 'button', href: `#/compare/${second}/${first}` }, t('compare.swap'))),
@@ -59,13 +58,11 @@ export async function compare(main, session, first, second) {
         h('div', { className: 'legend' }, t('compare.smaller'), h('span', { className: 'ramp difference' }), t('compare.larger'), ' ±20 mm', surface,
           h('span', {}, t('compare.posed')))),
       h('section', { className: 'card table-card' },
-        h('div', { className: 'bar' },
-          segmented(t('result.pose'), [['as-scanned', t('result.as-scanned')], ['standard', t('result.standard')]], settings.pose, change('pose')),
-          segmented(t('result.unit'), [['cm', t('unit.cm')], ['in', t('unit.in')]], settings.unit, change('unit')),
+        h('div', { className: 'bar' }, table.pose, table.unit,
           h('span', { className: 'small soft' }, t('compare.note'))),
         h('div', { className: 'table-scroll', tabIndex: 0, role: 'region', 'aria-label': t('compare.title') },
           h('table', { id: 'compared' }, h('thead', {}, head), body)))));
-  await table();
+  await table.show();
   show3d();
-  return () => { closed = true; if (viewer) viewer.close(); };
+  return () => { closed = true; table.close(); if (viewer) viewer.close(); };
 }

@@ -61,13 +61,14 @@ export function ask(title, text, yes, no, danger = false) {
   });
 }
 
+// One of several; who is told of a tap presses the button when the choice is carried out.
 export function segmented(label, options, chosen, choose) {
-  const buttons = options.map(([value, words]) => h('button', {
-    type: 'button', 'aria-pressed': String(value === chosen), 'data-value': value,
-    onclick: () => {
-      for (const button of buttons) button.setAttribute('aria-pressed', String(button.dataset.value === value));
-      choose(value);
-    },
-  }, words));
-  return h('div', { className: 'segmented', role: 'group', 'aria-label': label }, buttons);
+  const group = h('div', { className: 'segmented', role: 'group', 'aria-label': label }, options.map(([value, words]) =>
+    h('button', { type: 'button', 'data-value': value, onclick: () => choose(value) }, words)));
+  press(group, chosen);
+  return group;
+}
+
+export function press(group, value) {
+  for (const button of group.children) button.setAttribute('aria-pressed', String(button.dataset.value === value));
 }

@@ -1,10 +1,11 @@
 // A result: the body, its lines and its table, which light each other up.
 
 import { address, bytes, get } from './api.js';
-import { h, notice, segmented } from './dom.js';
+import { h, press, segmented } from './dom.js';
 import { currentLanguage, outcome, said, t, time } from './i18n.js';
 import { readPly } from './ply.js';
-import { choose, digits, settings } from './settings.js';
+import { digits, settings } from './settings.js';
+import { switches } from './switches.js';
 
 const LOOKS = { ok: 'good', rescan: 'warn', failed: 'bad' };
 
@@ -29,11 +30,10 @@ export async function result(main, session, scanId) {
     h('div', { className: 'name', id: 'line-name' }, t('result.tap')), h('div', { className: 'wait' }, t('result.loading')));
   const body = h('tbody', { className: 'rows', id: 'rows' });
   const sides = h('tbody', { className: 'sides', id: 'differences' });
-  const query = () => `pose=${settings.pose}&unit=${settings.unit}&language=${currentLanguage()}`;
+  const query = ({ pose, unit }) => `pose=${pose}&unit=${unit}&language=${currentLanguage()}`;
   const note = h('p', { className: 'small soft', hidden: true }, t('result.standardNote'));
 
-  async function table() {
-    const { rows, differences } = await get(`${path}/measurements?${query()}`);
+  const table = switches((wanted) => get(`${path}/measurements?${query(wanted)}`), ({ rows, differences }) => {
     note.hidden = settings.pose !== 'standard';
     body.replaceChildren(...rows.map((row) => {
       const side = row.side ? ` (${t(`result.${row.side}`)})` : '';
@@ -52,7 +52,7 @@ export async function result(main, session, scanId) {
         h('td', { className: 'number interval' }, `${signed(row.low)} – ${signed(row.high)}`))));
     pick(chosen, false);
     links();
-  }
+  });
 
   function pick(name, toggle = true) {
     chosen = toggle && chosen === name ? null : name;
@@ -80,8 +80,9 @@ export async function result(main, session, scanId) {
       viewer.setLines(lines.measurements);
       viewer.onpick = (name) => { if (name) pick(name); };
       viewer.choose(chosen);
+      const look = segmented(t('result.view'), [['surface', t('result.surface')], ['cloud', t('result.cloud')]], 'surface', (what) => { viewer.show(what); press(look, what); });
       place.append(h('div', { className: 'tools' },
-        segmented(t('result.view'), [['surface', t('result.surface')], ['cloud', t('result.cloud')]], 'surface', (what) => viewer.show(what)),
+        look,
         ...['front', 'side', 'back'].map((side) => h('button', { onclick: () => viewer.look(side) }, t(`result.${side === 'back' ? 'backside' : side}`)))));
     } catch (error) {
       const wait = place.querySelector('.wait');
@@ -94,12 +95,12 @@ export async function result(main, session, scanId) {
   function links() {
     const item = (words, href, size) => h('a', { href: address(href), download: '' }, h('span', {}, words), h('span', { className: 'soft small' }, size || ''));
     menu.replaceChildren(
-      item(t('result.zip'), `${path}/result.zip?${query()}`),
-      item(t('result.pdf'), `${path}/sheet.pdf?${query()}`),
-      item(t('result.csv'), `${path}/measurements.csv?${query()}`),
+      item(t('result.zip'), `${path}/result.zip?${query(settings)}`),
+      item(t('result.pdf'), `${path}/sheet.pdf?${query(settings)}`),
+      item(t('result.csv'), `${path}/measurements.csv?${query(settings)}`),
       item(t('result.smis'), `${path}/individual.smis?pose=${settings.pose}`),
       ...files.map((file) => item(file.name, `${path}/files/${file.name}`, `${(file.bytes / 1e6).toFixed(1)} MB`)));
-    print.href = address(`${path}/sheet.pdf?${query()}`);
+    print.href = address(`${path}/sheet.pdf?${query(settings)}`);
   }
 
   const files = await get(`${path}/files`);
@@ -108,7 +109,6 @@ export async function result(main, session, scanId) {
     menu.hidden = !menu.hidden;
     opener.setAttribute('aria-expanded', String(!menu.hidden));
   } }, t('result.download'));
-  const change = (name) => (value) => { choose(name, value); table().catch((error) => notice(error.message, true)); };
   main.replaceChildren(
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, scan.label || t('result.noLabel')),
       h('span', { className: 'small soft' }, `${time(scan.created)} · ${scan.scan_id}`)), verdictChip(scan), h('span', { className: 'grow' }),
@@ -116,15 +116,13 @@ export async function result(main, session, scanId) {
     scan.reasons.length ? h('div', { className: 'banner warn' }, `${t('result.remarks')}: ${said(scan.reasons.join('; '))}`) : '',
     h('div', { className: 'result' }, place,
       h('section', { className: 'card table-card' },
-        h('div', { className: 'bar' },
-          segmented(t('result.pose'), [['as-scanned', t('result.as-scanned')], ['standard', t('result.standard')]], settings.pose, change('pose')),
-          segmented(t('result.unit'), [['cm', t('unit.cm')], ['in', t('unit.in')]], settings.unit, change('unit')), note),
+        h('div', { className: 'bar' }, table.pose, table.unit, note),
         h('div', { className: 'table-scroll', tabIndex: 0, role: 'region', 'aria-label': t('result.title') },
           h('table', {}, h('thead', {}, h('tr', {}, h('th', {}, t('result.name')), h('th', { className: 'number' }, t('result.value')),
             h('th', { className: 'number' }, t('result.interval')))), body, sides)))));
   const shut = (event) => { if (!event.target.closest('.menu')) { menu.hidden = true; opener.setAttribute('aria-expanded', 'false'); } };
   document.addEventListener('click', shut);
-  await table();
+  await table.show();
   show3d();
-  return () => { closed = true; document.removeEventListener('click', shut); if (viewer) viewer.close(); };
+  return () => { closed = true; table.close(); document.removeEventListener('click', shut); if (viewer) viewer.close(); };
 }
