@@ -128,6 +128,13 @@ def test_copies_that_stay_are_told_before_a_scan_is_deleted(
                 dialog.get_by_role("button", name="Cancel").click()
         finally:
             ledger.forget(scan_id)
+        # Handed over while the question was open: the answer to the deletion names them.
+        deleted = {"scans": [scan_id], "handed_over": ["orders"]}
+        erase.click()
+        expect(dialog).to_be_visible(timeout=LONG_MS)
+        page.route(f"**/scans/{scan_id}", lambda route: route.fulfill(json=deleted))
+        page.click("#affirm")
+        expect(page.locator(".notice")).to_contain_text("Copies handed over to orders stay there")
 
 
 def test_a_table_that_does_not_come_moves_no_switch(

@@ -45,14 +45,16 @@ export async function history(main, session) {
         mayDelete ? h('button', { className: 'danger', onclick: () => erase(scan, name) }, t('history.delete')) : null)));
   }
 
+  const copies = (receivers) => (receivers.length ? ` ${t('history.copies', { names: receivers.join(', ') })}` : '');
+
   async function erase(scan, name) {
     try {
       const { handed_over: receivers } = await get(`/scans/${scan.scan_id}`);
       const text = t('history.sureText', { name: `${name}, ${time(scan.created)}` });
-      const copies = receivers.length ? ` ${t('history.copies', { names: receivers.join(', ') })}` : '';
-      if (!await ask(t('history.sure'), text + copies, t('history.delete'), t('cancel'), true)) return;
-      await remove(`/scans/${scan.scan_id}`);
-      notice(t('history.deleted'));
+      if (!await ask(t('history.sure'), text + copies(receivers), t('history.delete'), t('cancel'), true)) return;
+      // It may have been handed over while the question was open.
+      const { handed_over: keepers } = await remove(`/scans/${scan.scan_id}`);
+      notice(t('history.deleted') + copies(keepers));
       forget(scan.scan_id);
     } catch (error) { notice(error.message, true); }
   }
