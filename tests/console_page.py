@@ -35,6 +35,13 @@ _MOVING = """async () => {
   return false;
 }"""
 
+_EVENTS = """
+window.EventSource = class extends EventTarget {
+  constructor() { super(); window.source = this; }
+  close() {}
+};
+"""
+
 
 @contextmanager
 def browser() -> Iterator[Browser]:
@@ -62,6 +69,19 @@ def log_in(page: Page, console: LiveConsole) -> None:
 
 def open_view(page: Page, console: LiveConsole, view: str) -> None:
     page.goto(f"{console.url}/#/{view}")
+
+
+def events_by_hand(page: Page, console: LiveConsole) -> None:
+    """Load the page so that it hears only what `tell` tells it."""
+    page.add_init_script(_EVENTS)
+    page.goto(console.url)
+    wait_for_value(page, "window.source !== undefined")
+
+
+def tell(page: Page, kind: str, **data: Any) -> None:
+    """Tell the page of an event."""
+    event = "new MessageEvent(kind, { data: JSON.stringify(data) })"
+    page.evaluate(f"([kind, data]) => window.source.dispatchEvent({event})", [kind, data])
 
 
 def wait_for_value(page: Page, expression: str) -> Any:

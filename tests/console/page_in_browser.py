@@ -19,11 +19,13 @@ import pytest
 from console_page import (
     LONG_MS,
     browser,
+    events_by_hand,
     four_pictures_move,
     log_in,
     more_frames,
     open_view,
     tablet,
+    tell,
     wait_for_value,
 )
 from live_console import API, LiveConsole
@@ -184,6 +186,30 @@ def test_a_touched_line_finds_its_row(
         if chosen.count():
             break
     expect(chosen).to_have_count(1)
+
+
+def test_a_scan_that_is_deleted_elsewhere(
+    page: Page, console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    """Its outcome stayed, with a link to a result that did not exist any more."""
+    mine = scans[0]
+    deleted = {"scan_id": mine["scan_id"], "state": "deleted"}
+    events_by_hand(page, console)
+    latest = page.locator("#latest a")
+    expect(latest.first).to_be_visible(timeout=LONG_MS)
+    page.route("**/scans?limit=4", lambda route: route.fulfill(json={"scans": [], "next": ""}))
+    tell(page, "result", **scans[1])
+    expect(latest).to_have_count(0, timeout=LONG_MS)
+    page.unroute("**/scans?limit=4")
+    tell(page, "scan", **{**deleted, "scan_id": "another"})
+    expect(latest.first).to_be_visible(timeout=LONG_MS)
+    page.route("**/api/v1/scans", lambda route: route.fulfill(json=mine))
+    page.click("#go")
+    expect(page.locator("#open")).to_be_visible(timeout=LONG_MS)
+    tell(page, "scan", **deleted)
+    expect(page.locator(".notice")).to_have_text("This scan was deleted.")
+    expect(page.locator("#open")).to_have_count(0)
+    expect(page.locator("#label")).to_be_visible()
 
 
 def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> None:

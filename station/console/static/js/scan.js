@@ -12,6 +12,7 @@ const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
 const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
+const TOGETHER_MS = 250;
 
 // What the view told when it was left: it is told on where it is drawn again in another language.
 let kept = null;
@@ -197,13 +198,20 @@ export async function scan(main, session) {
     latest();
   }
 
-  const list = h('div', { className: 'stack' });
+  const list = h('div', { className: 'stack', id: 'latest' });
+  let listing = null;
   async function latest() {
     try {
       const { scans } = await get('/scans?limit=4');
       list.replaceChildren(...scans.map((one) => h('a', { className: 'small', href: `#/result/${one.scan_id}` },
         `${one.label || t('result.noLabel')} – ${t(`state.${outcome(one)}`)}, ${time(one.created)}`)));
     } catch { /* told elsewhere */ }
+  }
+
+  // All scans of a label may be deleted at once.
+  function latestSoon() {
+    clearTimeout(listing);
+    listing = setTimeout(latest, TOGETHER_MS);
   }
 
   async function look() {
@@ -223,8 +231,13 @@ export async function scan(main, session) {
       if (!current) ready();
       else allow();
     }
+    const over = kind === 'scan' && ['failed', 'deleted'].includes(data.state);
+    if (over || ['job', 'result', 'reset', 'back'].includes(kind)) latestSoon();
     if (!current || data.scan_id !== current.scan_id) return;
-    if (kind === 'scan' && data.state !== 'deleted') {
+    if (kind === 'scan' && data.state === 'deleted') {
+      notice(t('scan.deleted'));
+      ready();
+    } else if (kind === 'scan') {
       const { state: next, framesets, wanted, reason } = data;
       take({ state: next, framesets, wanted, reasons: reason ? [reason] : [] }, { left_s: data.left_s });
     } else if (kind === 'job') take({ state: data.state });
@@ -248,6 +261,7 @@ export async function scan(main, session) {
     kept = { label, pressed, took, current };
     clearInterval(timer);
     clearInterval(looking);
+    clearTimeout(listing);
     silence();
     cameras.close();
   };
