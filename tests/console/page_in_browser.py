@@ -210,6 +210,14 @@ def test_a_scan_that_is_deleted_elsewhere(
     expect(page.locator(".notice")).to_have_text("This scan was deleted.")
     expect(page.locator("#open")).to_have_count(0)
     expect(page.locator("#label")).to_be_visible()
+    # Its body and its numbers stayed, too.
+    for view in (f"result/{mine['scan_id']}", f"compare/{scans[1]['scan_id']}/{mine['scan_id']}"):
+        open_view(page, console, view)
+        expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
+        tell(page, "scan", **{**deleted, "scan_id": "another"})
+        tell(page, "scan", **deleted)
+        expect(page.locator("h1")).to_have_text("This scan was deleted.")
+        expect(page.locator("canvas")).to_have_count(0)
 
 
 def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> None:

@@ -1,6 +1,7 @@
 // Two scans: where the bodies differ in colours, and which measurements really do.
 
 import { bytes, get } from './api.js';
+import { emptyWhenDeleted } from './deleted.js';
 import { h } from './dom.js';
 import { currentLanguage, t, time } from './i18n.js';
 import { readPly } from './ply.js';
@@ -64,5 +65,13 @@ export async function compare(main, session, first, second) {
           h('table', { id: 'compared' }, h('thead', {}, head), body)))));
   await table.show();
   show3d();
-  return () => { closed = true; table.close(); if (viewer) viewer.close(); };
+  const leave = () => {
+    if (closed) return;
+    closed = true;
+    silence();
+    table.close();
+    if (viewer) viewer.close();
+  };
+  const silence = emptyWhenDeleted(main, [first, second], leave);
+  return leave;
 }

@@ -1,6 +1,7 @@
 // A result: the body, its lines and its table, which light each other up.
 
 import { address, bytes, get } from './api.js';
+import { emptyWhenDeleted } from './deleted.js';
 import { h, press, segmented } from './dom.js';
 import { currentLanguage, outcome, said, t, time } from './i18n.js';
 import { readPly } from './ply.js';
@@ -124,5 +125,14 @@ export async function result(main, session, scanId) {
   document.addEventListener('click', shut);
   await table.show();
   show3d();
-  return () => { closed = true; table.close(); document.removeEventListener('click', shut); if (viewer) viewer.close(); };
+  const leave = () => {
+    if (closed) return;
+    closed = true;
+    silence();
+    table.close();
+    document.removeEventListener('click', shut);
+    if (viewer) viewer.close();
+  };
+  const silence = emptyWhenDeleted(main, [scanId], leave);
+  return leave;
 }
