@@ -37,7 +37,7 @@ _MOVING = """async () => {
 
 _EVENTS = """
 window.EventSource = class extends EventTarget {
-  constructor() { super(); window.source = this; }
+  constructor() { super(); this.readyState = 0; window.source = this; }
   close() {}
 };
 """

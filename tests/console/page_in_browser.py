@@ -343,6 +343,30 @@ def test_a_lost_console_comes_back_by_itself(page: Page, console: LiveConsole) -
     expect(page.locator("#password")).to_have_count(0)
 
 
+def test_a_page_without_a_connection(page: Page, console: LiveConsole) -> None:
+    """It said "Failed to fetch", in Chinese too, and everything looked well and could be pressed."""
+    events_by_hand(page, console)
+    page.select_option("#language", "zh")
+    states = page.locator("[data-camera] .chip")
+    for told, state, look in (("error", "未知", "chip "), ("open", "正常", "chip good")):
+        page.evaluate(f"window.source.on{told}()")
+        expect(states).to_have_text([state] * 2, timeout=LONG_MS)
+        expect(states.first).to_have_class(look)
+        expect(page.locator("#go")).to_be_enabled(enabled=told == "open", timeout=LONG_MS)
+    page.evaluate("window.source.onerror()")
+    page.route("**/*", lambda route: route.abort())
+    # The first view has been shown already, the other's script was not loaded yet.
+    for view in ("history", "scan", "booth"):
+        open_view(page, console, view)
+        expect(page.get_by_role("alert")).to_have_text(
+            "无法连接控制台。控制台恢复响应后即可继续。", timeout=LONG_MS
+        )
+    page.unroute("**/*")
+    page.evaluate("window.source.onopen()")
+    expect(states).to_have_text(["正常"] * 4, timeout=LONG_MS)
+    page.select_option("#language", "en")
+
+
 def test_chinese(page: Page, console: LiveConsole, scans: list[dict[str, Any]]) -> None:
     page.goto(console.url)
     page.select_option("#language", "zh")

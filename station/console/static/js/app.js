@@ -1,6 +1,6 @@
 // The page's frame: who is logged in, which view is shown, whether the console answers.
 
-import { get, remove } from './api.js';
+import { get, reached, remove } from './api.js';
 import { h, icon, notice } from './dom.js';
 import { connect, disconnect, listen } from './events.js';
 import { currentLanguage, loadWords, setLanguage, t } from './i18n.js';
@@ -23,6 +23,7 @@ const rail = document.getElementById('rail');
 let session = null;
 let leave = () => {};
 let turn = 0;
+let failed = false;
 
 function drawRail() {
   rail.setAttribute('aria-label', t('nav.main'));
@@ -64,6 +65,7 @@ function wanted() {
 async function show({ again = false } = {}) {
   const [view, rest] = wanted();
   const mine = ++turn;
+  failed = false;
   leave();
   leave = () => {};
   for (const link of rail.querySelectorAll('[data-view]')) {
@@ -72,7 +74,7 @@ async function show({ again = false } = {}) {
   }
   document.title = `${t(`${view === 'calibration' ? 'cal' : view}.title`)} – ${t('app.title')}`;
   try {
-    const draw = await VIEWS[view]();
+    const draw = await reached(VIEWS[view]());
     // Drawn aside: a slow view that was left meanwhile must not cover the one that came after it.
     const place = h('div');
     const left = await draw(place, { ...session, again }, ...rest.map(decodeURIComponent));
@@ -81,6 +83,7 @@ async function show({ again = false } = {}) {
     leave = left;
   } catch (error) {
     if (mine !== turn || error.kind === 'not-logged-in') return;
+    failed = true;
     main.replaceChildren(h('div', { className: 'empty' }, h('h1', {}, t('error')), h('p', { role: 'alert' }, error.message)));
   }
 }
@@ -112,6 +115,7 @@ listen((kind) => {
     lostNotice.remove();
     lostNotice = null;
     notice(t('back'));
+    if (failed) show();
   }
 });
 window.addEventListener('hashchange', () => show());

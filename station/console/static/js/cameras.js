@@ -1,6 +1,8 @@
 // Cards of cameras: picture, state, remedy.
 
+import { get } from './api.js';
 import { h } from './dom.js';
+import { isLost, listen } from './events.js';
 import { said, t } from './i18n.js';
 import { Pictures } from './pictures.js';
 
@@ -13,6 +15,10 @@ export class Cameras {
     this.present = new Map();
     this.onpresence = null;
     for (const name of names) this.add(name);
+    this.silence = listen((kind) => {
+      if (kind === 'lost') this.forget();
+      else if (kind === 'back') this.look();
+    });
     this.pictures = new Pictures((name, bitmap, somebody) => this.draw(name, bitmap, somebody));
   }
 
@@ -26,15 +32,30 @@ export class Cameras {
     this.element.append(card);
   }
 
+  // Who hears nothing knows nothing of the cameras.
+  forget() {
+    for (const name of this.cards.keys()) {
+      this.state({ name });
+      this.draw(name, null, null);
+    }
+  }
+
+  async look() {
+    try {
+      for (const camera of (await get('/booth')).cameras) this.state(camera);
+    } catch { /* lost again */ }
+  }
+
   state(camera) {
     const card = this.cards.get(camera.name);
     if (!card) return;
-    card.chip.className = `chip ${LOOKS[camera.state] ?? ''}`;
-    card.chip.textContent = t(`camera.${camera.state}`);
-    card.card.dataset.state = camera.state;
-    const amiss = camera.state === 'lost' || camera.state === 'dead';
-    card.remedy.hidden = !(amiss && camera.detail);
-    card.remedy.textContent = said(camera.detail);
+    const state = isLost() ? 'unknown' : camera.state;
+    card.chip.className = `chip ${LOOKS[state] ?? ''}`;
+    card.chip.textContent = t(`camera.${state}`);
+    card.card.dataset.state = state;
+    const amiss = state === 'lost' || state === 'dead';
+    card.remedy.textContent = amiss ? said(camera.detail) : '';
+    card.remedy.hidden = !card.remedy.textContent;
   }
 
   draw(name, bitmap, somebody) {
@@ -63,5 +84,8 @@ export class Cameras {
     return seen.length ? seen.some(Boolean) : null;
   }
 
-  close() { this.pictures.close(); }
+  close() {
+    this.silence();
+    this.pictures.close();
+  }
 }

@@ -1,6 +1,6 @@
 // Two scans: where the bodies differ in colours, and which measurements really do.
 
-import { bytes, get } from './api.js';
+import { bytes, get, reached } from './api.js';
 import { emptyWhenDeleted } from './deleted.js';
 import { h } from './dom.js';
 import { currentLanguage, t, time } from './i18n.js';
@@ -37,7 +37,7 @@ export async function compare(main, session, first, second) {
   async function show3d() {
     try {
       const [{ Viewer, differenceColours }, mesh, signed] = await Promise.all([
-        import('./viewer.js'), bytes(`${path}/files/mesh.ply`), bytes(`${path}/comparison/${second}/distances`)]);
+        reached(import('./viewer.js')), bytes(`${path}/files/mesh.ply`), bytes(`${path}/comparison/${second}/distances`)]);
       if (closed) return;
       place.querySelector('.wait').remove();
       viewer = new Viewer(place, t('result.model'));
@@ -46,7 +46,7 @@ export async function compare(main, session, first, second) {
         ...['front', 'side', 'back'].map((side) => h('button', { onclick: () => viewer.look(side) }, t(`result.${side === 'back' ? 'backside' : side}`)))));
     } catch (error) {
       const wait = place.querySelector('.wait');
-      if (wait) wait.textContent = t('result.no3d');
+      if (wait) wait.textContent = error.kind === 'unreachable' ? error.message : t('result.no3d');
       console.warn(error);
     }
   }

@@ -15,6 +15,8 @@ export function listen(heard) {
   return () => listeners.delete(heard);
 }
 
+export const isLost = () => lost;
+
 function tell(kind, data) { for (const heard of [...listeners]) heard(kind, data); }
 
 export function connect() {

@@ -1,6 +1,6 @@
 // A result: the body, its lines and its table, which light each other up.
 
-import { address, bytes, get } from './api.js';
+import { address, bytes, get, reached } from './api.js';
 import { emptyWhenDeleted } from './deleted.js';
 import { h, press, segmented } from './dom.js';
 import { currentLanguage, outcome, said, t, time } from './i18n.js';
@@ -72,7 +72,7 @@ export async function result(main, session, scanId) {
   async function show3d() {
     try {
       const [{ Viewer }, mesh, lines, cloud] = await Promise.all([
-        import('./viewer.js'), bytes(`${path}/files/mesh.ply`), get(`${path}/files/measurements.json`), bytes(`${path}/files/cloud.ply`)]);
+        reached(import('./viewer.js')), bytes(`${path}/files/mesh.ply`), get(`${path}/files/measurements.json`), bytes(`${path}/files/cloud.ply`)]);
       if (closed) return;
       place.querySelector('.wait').remove();
       viewer = new Viewer(place, t('result.model'));
@@ -87,7 +87,7 @@ export async function result(main, session, scanId) {
         ...['front', 'side', 'back'].map((side) => h('button', { onclick: () => viewer.look(side) }, t(`result.${side === 'back' ? 'backside' : side}`)))));
     } catch (error) {
       const wait = place.querySelector('.wait');
-      if (wait) wait.textContent = t('result.no3d');
+      if (wait) wait.textContent = error.kind === 'unreachable' ? error.message : t('result.no3d');
       console.warn(error);
     }
   }

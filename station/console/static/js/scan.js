@@ -3,7 +3,7 @@
 import { freshKey, get, post } from './api.js';
 import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
-import { listen } from './events.js';
+import { isLost, listen } from './events.js';
 import { bodyFigure } from './figure.js';
 import { outcome, said, t, time } from './i18n.js';
 import { troubleBanner } from './troubles.js';
@@ -59,7 +59,7 @@ export async function scan(main, session) {
   // A press that the booth would refuse is not offered; the banner says what is in the way.
   function allow() {
     for (const button of stage.querySelectorAll('#go, #again')) {
-      button.disabled = asked || !streaming || !able;
+      button.disabled = asked || isLost() || !streaming || !able;
     }
   }
 
@@ -225,7 +225,8 @@ export async function scan(main, session) {
 
   const silence = listen((kind, data) => {
     if (kind === 'camera') cameras.state(data);
-    if (kind === 'camera' || kind === 'fault') look();
+    if (['camera', 'fault', 'back'].includes(kind)) look();
+    if (kind === 'lost') allow();
     if (kind === 'framesets' && data.streaming !== streaming) {
       streaming = data.streaming;
       if (!current) ready();
