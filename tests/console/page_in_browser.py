@@ -253,6 +253,28 @@ def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
     assert not (console.config.spool.folder / "outbox" / gone["scan_id"]).exists()
 
 
+def test_a_scan_that_is_being_measured_is_not_offered_for_deletion(
+    page: Page, console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    """The question promised a deletion that was then refused."""
+    events_by_hand(page, console)
+    scan = {**scans[0], "state": "reconstructing"}
+    page.route("**/scans?*", lambda route: route.fulfill(json={"scans": [scan], "next": ""}))
+    open_view(page, console, "history")
+    erase = page.get_by_role("button", name="Delete")
+    expect(erase).to_be_disabled(timeout=LONG_MS)
+    expect(erase).to_have_attribute("title", re.compile("is being measured"))
+    scan["state"] = "accepted"
+    tell(page, "job", **scan)
+    expect(erase).to_be_enabled(timeout=LONG_MS)
+    # It is taken up before the page hears of it.
+    scan["state"] = "reconstructing"
+    page.route("**/scans/*", lambda route: route.fulfill(json=scan))
+    erase.click()
+    expect(page.locator(".notice.bad")).to_contain_text("is being measured")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+
+
 def test_a_calibration_step_from_recordings(page: Page, console: LiveConsole) -> None:
     open_view(page, console, "calibration")
     expect(page.locator("#now")).to_be_visible()

@@ -42,16 +42,19 @@ export async function history(main, session) {
       h('td', {}, time(scan.created)), h('td', {}, verdictChip(scan)),
       h('td', {}, h('div', { className: 'row-actions' },
         done ? h('a', { className: 'button', href: `#/result/${scan.scan_id}` }, t('history.open')) : null,
-        mayDelete ? h('button', { className: 'danger', onclick: () => erase(scan, name) }, t('history.delete')) : null)));
+        mayDelete ? h('button', { className: 'danger', disabled: measured(scan), title: measured(scan) && t('history.measured'), onclick: () => erase(scan, name) }, t('history.delete')) : null)));
   }
 
+  // Its deletion would be refused.
+  const measured = (scan) => scan.state === 'reconstructing';
   const copies = (receivers) => (receivers.length ? ` ${t('history.copies', { names: receivers.join(', ') })}` : '');
 
   async function erase(scan, name) {
     try {
-      const { handed_over: receivers } = await get(`/scans/${scan.scan_id}`);
+      const now = await get(`/scans/${scan.scan_id}`);
+      if (measured(now)) { notice(t('history.measured'), true); return; }
       const text = t('history.sureText', { name: `${name}, ${time(scan.created)}` });
-      if (!await ask(t('history.sure'), text + copies(receivers), t('history.delete'), t('cancel'), true)) return;
+      if (!await ask(t('history.sure'), text + copies(now.handed_over), t('history.delete'), t('cancel'), true)) return;
       // It may have been handed over while the question was open.
       const { handed_over: keepers } = await remove(`/scans/${scan.scan_id}`);
       notice(t('history.deleted') + copies(keepers));
