@@ -10,6 +10,8 @@ import { switches } from './switches.js';
 
 const LOOKS = { ok: 'good', rescan: 'warn', failed: 'bad' };
 
+const size = (count) => (count < 1e5 ? `${Math.ceil(count / 1e3)} kB` : `${(count / 1e6).toFixed(1)} MB`);
+
 export function verdictChip(scan) {
   const ended = outcome(scan);
   const look = ended === 'cancelled' ? '' : LOOKS[scan.verdict] ?? '';
@@ -100,7 +102,7 @@ export async function result(main, session, scanId) {
       item(t('result.pdf'), `${path}/sheet.pdf?${query(settings)}`),
       item(t('result.csv'), `${path}/measurements.csv?${query(settings)}`),
       item(t('result.smis'), `${path}/individual.smis?pose=${settings.pose}`),
-      ...files.map((file) => item(file.name, `${path}/files/${file.name}`, `${(file.bytes / 1e6).toFixed(1)} MB`)));
+      ...files.map((file) => item(file.name, `${path}/files/${file.name}`, size(file.bytes))));
     print.href = address(`${path}/sheet.pdf?${query(settings)}`);
   }
 
