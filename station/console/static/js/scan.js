@@ -198,7 +198,7 @@ export async function scan(main, session) {
     latest();
   }
 
-  const list = h('div', { className: 'stack', id: 'latest' });
+  const list = h('div', { className: 'stack' });
   let listing = null;
   async function latest() {
     try {
