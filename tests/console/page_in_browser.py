@@ -382,7 +382,7 @@ def test_a_lost_console_comes_back_by_itself(page: Page, console: LiveConsole) -
 
 
 def test_a_page_without_a_connection(page: Page, console: LiveConsole) -> None:
-    """It said "Failed to fetch", in Chinese too, and everything looked well and could be pressed."""
+    """It said "Failed to fetch", in Chinese too; cameras looked well, and scans could be begun."""
     events_by_hand(page, console)
     page.select_option("#language", "zh")
     states = page.locator("[data-camera] .chip")
