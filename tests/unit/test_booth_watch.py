@@ -29,7 +29,7 @@ from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
 from station.core.config_file import load_config
-from station.core.scans import CANCELLED, scan_id_of
+from station.core.scans import CANCELLED, ScanId, ScanNote, scan_id_of
 from station.core.spool import Spool
 from station.messaging.messages import CameraHealth
 from station.messaging.transport import publisher
@@ -142,6 +142,26 @@ def test_no_distances_of_a_deleted_body_are_kept(watch: tuple[Watch, EventLog]) 
     )
     purge_scans(spool, ["a"], Deleted())
     _until(lambda: compare_surfaces.cache_info().currsize == 0)
+
+
+def test_a_result_that_is_taken_away_is_not_said_to_be_deleted(
+    watch: tuple[Watch, EventLog],
+) -> None:
+    """The page lost the outcome of a scan as soon as a program had collected its result."""
+    watching, events = watch
+    spool = Spool(watching._config.spool.folder)
+    for scan_id in (ScanId("a"), ScanId("b")):
+        spool.path("outbox", scan_id).mkdir()
+        spool.notes.write(ScanNote(scan_id, "delivered"), durable=False)
+    _until(lambda: set(watching._seen or {}) == {"a", "b"})
+    spool.path("outbox", "a").rmdir()
+    purge_scans(spool, ["b"], Deleted())
+
+    def told() -> dict[str, str]:
+        scans = [json.loads(event.data) for event in events.after(0) if event.kind == "scan"]
+        return {scan["scan_id"]: scan["state"] for scan in scans}
+
+    _until(lambda: told() == {"a": "taken", "b": "deleted"})
 
 
 def test_what_status_says_is_said_by_the_console(

@@ -21,6 +21,7 @@ from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
+from station.core.scans import ScanId
 from station.core.spool import Spool
 from station.messaging.messages import CameraHealth, Request, ScanEvent
 from station.messaging.transport import endpoint, subscriber
@@ -58,7 +59,8 @@ class Watch:
 
     def __init__(self, config: BoothConfig, events: EventLog, log: logging.Logger) -> None:
         self._config, self._events, self._log = config, events, log
-        self._index = ScanIndex(Spool(config.spool.folder))
+        self._spool = Spool(config.spool.folder)
+        self._index = ScanIndex(self._spool)
         self._cameras = {camera.name: CameraState(camera.name) for camera in config.cameras}
         self._status: dict[str, Any] = {}
         self._fault = ""
@@ -66,6 +68,8 @@ class Watch:
         self._round_s = time.monotonic()
         self._rate_hz: float | None = None
         self._seen: dict[str, str] | None = None
+        self._missing: set[str] = set()
+        """Scans that left the folders and have a note."""
         self._spool_ns: tuple[int, ...] = ()
         self._stop = threading.Event()
         self._threads = [
@@ -202,7 +206,7 @@ class Watch:
         changed = tuple(
             (folder / place).stat().st_mtime_ns for place in PLACES if (folder / place).is_dir()
         )
-        settled = changed == self._spool_ns and not moved
+        settled = changed == self._spool_ns and not moved and not self._missing
         if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
@@ -214,9 +218,18 @@ class Watch:
         for scan_id, state in states.items():
             if before is not None and before.get(scan_id) != state:
                 self._tell(found[scan_id])
-        for scan_id in (before or {}).keys() - states.keys():
-            if self._index.get(scan_id) is None:
+        missing = {*self._missing, *(before or {}).keys() - states.keys()}
+        self._missing, looked_for = set(), self._missing
+        for scan_id in missing:
+            if self._index.get(scan_id) is not None:
+                continue
+            if not self._spool.notes.path(ScanId(scan_id)).exists():
                 self._events.append("scan", {"scan_id": scan_id, "state": "deleted"})
+            elif scan_id in looked_for:
+                self._events.append("scan", {"scan_id": scan_id, "state": "taken"})
+            else:
+                # A deletion removes the note in a moment.
+                self._missing.add(scan_id)
 
     def _tell(self, scan: ScanRecord) -> None:
         done = scan.state in ("delivered", "rescan", "failed")

@@ -1,7 +1,7 @@
 // Two scans: where the bodies differ in colours, and which measurements really do.
 
 import { bytes, get, reached } from './api.js';
-import { emptyWhenDeleted } from './deleted.js';
+import { emptyWhenGone } from './deleted.js';
 import { h } from './dom.js';
 import { currentLanguage, t, time } from './i18n.js';
 import { readPly } from './ply.js';
@@ -74,6 +74,6 @@ export async function compare(main, session, first, second) {
     table.close();
     if (viewer) viewer.close();
   };
-  const silence = emptyWhenDeleted(main, [first, second], leave);
+  const silence = emptyWhenGone(main, [first, second], leave);
   return leave;
 }

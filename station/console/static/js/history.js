@@ -97,7 +97,7 @@ export async function history(main, session) {
   count();
   await load();
   const silence = listen((kind, data) => {
-    if (kind === 'scan' && data.state === 'deleted') forget(data.scan_id);
+    if (kind === 'scan' && ['deleted', 'taken'].includes(data.state)) forget(data.scan_id);
     else if (kind === 'result' || kind === 'job' || kind === 'reset' || kind === 'back') soon();
   });
   return () => { clearTimeout(typing); silence(); };

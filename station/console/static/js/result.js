@@ -1,7 +1,7 @@
 // A result: the body, its lines and its table, which light each other up.
 
 import { address, bytes, get, reached } from './api.js';
-import { emptyWhenDeleted } from './deleted.js';
+import { emptyWhenGone } from './deleted.js';
 import { h, press, segmented } from './dom.js';
 import { currentLanguage, outcome, said, t, time } from './i18n.js';
 import { readPly } from './ply.js';
@@ -135,6 +135,6 @@ export async function result(main, session, scanId) {
     document.removeEventListener('click', shut);
     if (viewer) viewer.close();
   };
-  const silence = emptyWhenDeleted(main, [scanId], leave);
+  const silence = emptyWhenGone(main, [scanId], leave);
   return leave;
 }

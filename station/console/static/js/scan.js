@@ -232,12 +232,15 @@ export async function scan(main, session) {
       if (!current) ready();
       else allow();
     }
-    const over = kind === 'scan' && ['failed', 'deleted'].includes(data.state);
+    const over = kind === 'scan' && ['failed', 'deleted', 'taken'].includes(data.state);
     if (over || ['job', 'result', 'reset', 'back'].includes(kind)) latestSoon();
     if (!current || data.scan_id !== current.scan_id) return;
     if (kind === 'scan' && data.state === 'deleted') {
       notice(t('scan.deleted'));
       ready();
+    } else if (kind === 'scan' && data.state === 'taken') {
+      // The outcome stays, without its link.
+      document.getElementById('open')?.remove();
     } else if (kind === 'scan') {
       const { state: next, framesets, wanted, reason } = data;
       take({ state: next, framesets, wanted, reasons: reason ? [reason] : [] }, { left_s: data.left_s });
