@@ -19,7 +19,7 @@ from pathlib import Path
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
 from station.core.files import private_file
-from station.core.scans import is_scan_id
+from station.core.scans import is_scan_id, plain_label
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -87,8 +87,9 @@ class ScanIndex:
             where.append("(instr(sought, ?) OR instr(lower(scan_id), ?))")
             values += [text.casefold(), text.lower()]
         if label is not None:
-            where.append("label = ?")
-            values.append(label)
+            # Earlier versions kept labels as they were given.
+            where.append("label IN (?, ?)")
+            values += [label, plain_label(label)]
         if since:
             where.append("created >= ?")
             values.append(since)

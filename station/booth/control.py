@@ -41,7 +41,6 @@ from station.booth.session import (
     UNSURE,
     Session,
     overdue,
-    plain_label,
     state_of,
 )
 from station.core.commands import config_option
@@ -49,7 +48,15 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import disk_words, private_folder, write_json
-from station.core.scans import CANCELLED, ScanId, ScanNote, boot_id, failure_reason, scan_id_of
+from station.core.scans import (
+    CANCELLED,
+    ScanId,
+    ScanNote,
+    boot_id,
+    failure_reason,
+    plain_label,
+    scan_id_of,
+)
 from station.core.service import Heartbeat, die_with_parent, only_process, stop_event
 from station.core.spool import Spool
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent

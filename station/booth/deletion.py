@@ -17,7 +17,7 @@ from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import delete
-from station.core.scans import STATES, Notes, ScanId, scan_id_of
+from station.core.scans import STATES, Notes, ScanId, plain_label, scan_id_of
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
 
@@ -32,25 +32,27 @@ class NoScanError(SpoolError):
 
 
 def labelled(spool: Spool, label: str) -> list[ScanId]:
-    """Ids of all scans with exactly this label, also of those whose results were taken away.
+    """Ids of all scans with this label as lists show it, also of those whose results were taken
+    away.
 
     From the folders themselves: a full disk has no room for the index.
     """
     # What was there before a backup was restored is kept beside it.
     before = [Notes(folder) for folder in spool.folder.glob(".scans.before-restore*")]
     noted = ((one, notes.read(one)) for notes in (spool.notes, *before) for one in notes.ids())
-    found = {one for one, note in noted if note is not None and note.label == label}
+    wanted = plain_label(label)
+    found = {one for one, note in noted if note and plain_label(note.label) == wanted}
     for place in PLACES:
         for one in spool.scans_in(place):
             record = read_record(spool, place, one)
-            if record is not None and record.label == label:
+            if record is not None and plain_label(record.label) == wanted:
                 found.add(one)
     return sorted(found)
 
 
 def purge_scans(spool: Spool, scan_ids: Sequence[str], deleted: Deleted) -> None:
-    """Delete scans: their bundles, results, notes and names; all of them or, if one is refused,
-    none. What is deleted is added to ``deleted``.
+    """Delete scans: their bundles, results, notes and names; all of them or, if one is refused
+    when all are looked at, none. What is deleted is added to ``deleted``.
 
     Raises:
         InputError: one is not a valid scan id.

@@ -11,7 +11,6 @@ worker) may declare a scan failed; until then an unknown state is reported as un
 
 from __future__ import annotations
 
-import unicodedata
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,12 +22,6 @@ ON_DISK: frozenset[State] = frozenset({"accepted", "reconstructing", "delivered"
 UNSURE = "outcome not known yet; do not scan again"
 MAX_LABEL_LENGTH = 200
 """Characters; a note of a scan is read up to a limit."""
-
-
-def plain_label(text: str) -> str:
-    """A label in one line, without control characters, as lists show it: what looks the same is
-    the same."""
-    return " ".join("".join(" " if unicodedata.category(c) == "Cc" else c for c in text).split())
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ import re
 import secrets
 import shutil
 import time
+import unicodedata
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
@@ -83,6 +84,12 @@ def scan_id_of(text: object) -> ScanId:
 def is_scan_id(text: str) -> bool:
     """Whether a name is a scan id."""
     return _SCAN_ID.fullmatch(text) is not None
+
+
+def plain_label(text: str) -> str:
+    """A label in one line, without control characters, as lists show it: what looks the same is
+    the same."""
+    return " ".join("".join(" " if unicodedata.category(c) == "Cc" else c for c in text).split())
 
 
 def new_scan_id() -> ScanId:

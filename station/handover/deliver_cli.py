@@ -105,7 +105,9 @@ class HandOver:
             for entry in self._ledger.follow(section.name, wanted, noted):
                 # Whoever took it, or deleted it, may not know who has not received it.
                 words = "scan %s left the outbox before it was handed over to %s"
-                self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
+                if not self._spool.path("outbox", entry.scan_id).exists():
+                    about = {"scan": entry.scan_id}
+                    self._log.warning(words, entry.scan_id, entry.target, extra=about)
 
     def _serve(self, name: str, stop: threading.Event) -> None:
         while not stop.wait(_POLL_S):

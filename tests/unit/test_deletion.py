@@ -42,7 +42,11 @@ def test_a_label_is_also_that_of_results_that_were_taken_away(spool: Spool) -> N
     """The bundle and the note of one whose result a program had taken stayed, and it was said
     that there was no such scan."""
     spool.notes.write(ScanNote(ScanId("other"), "failed", label="Order 99"), durable=False)
-    found = labelled(spool, "Order 9")
+    # As it is given, with the space of a Chinese keyboard; it is kept as it is shown.
+    found = labelled(spool, " Order\u3000 9")
+    assert [scan.scan_id for scan in ScanIndex(spool).find(label="Order\u30009")] == [_ONE, _THREE][
+        ::-1
+    ]
     assert found == [_ONE, _TWO, _THREE]
     purge_scans(spool, found, Deleted())
     left = [path for path in spool.folder.rglob("*") if path.name.startswith("20261121")]

@@ -162,8 +162,8 @@ class Feed:
         silent = [name for name in last_s if now_s - last_s[name] > limit_s and name not in ended]
         if silent:
             why = "; ".join(f"camera {name} {self._why(name)}" for name in silent)
-            kept = "what was seen so far is kept; run the same command again"
-            raise CalibrationError(f"{why}; {self._remedy(silent)}; {kept}")
+            again = "run the same command again; it goes on from what is kept"
+            raise CalibrationError(f"{why}; {self._remedy(silent)}; {again}")
         taken = list(self._waiting)
         self._waiting.clear()
         return taken

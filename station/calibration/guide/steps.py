@@ -39,6 +39,8 @@ _OTHERS_S = 3.0
 """After the first camera others have so long to see it at rest, too."""
 _LEAST_WAVED = 0.25
 """Share of the whole time for which the ball is waved once more."""
+_LEAST_SHARE = 0.5
+"""Sightings of a ball waved anew, as a share of those before, that may replace them."""
 _WRITE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
 _MANY_WAIT = 60
@@ -317,9 +319,9 @@ class _Waved:
             self.session.begin_run()
 
     def replace_earlier(self) -> bool:
-        """Put what was seen anew in place of what was seen before; false where there is nothing."""
+        """Put what was seen anew in place of what was seen before; false where it is too little."""
         runs = [run for run in self.runs if run]
-        if not self.again or not runs:
+        if not self.again or sum(map(len, runs)) < _LEAST_SHARE * len(self.session.balls):
             return False
         self.session.replace_balls(runs)
         return True

@@ -28,7 +28,8 @@ _PATIENCE_S = 60.0
         **responses(),
         200: {
             "description": "Server-sent events: camera, framesets, scan, job, result, fault, "
-            "calibration, delivery; `reset` says that some were missed",
+            'calibration, delivery; a scan may also be "deleted", or "taken" by a program or '
+            "because its time was over; `reset` says that some were missed",
             "content": {"text/event-stream": {"schema": {"type": "string"}}},
         },
     },

@@ -34,7 +34,9 @@ _SILENT_S = 1.3
 """Health is sent twice a second; two missing reports mean that the capture process is gone."""
 _HANGS_S = 2.0
 """A round takes milliseconds; the supervisor waits longer before it acts."""
-_RECENT = 200
+_RECENT = 1000
+_DELETION_S = 3.0
+"""Time from the removal of a result to that of its note, on a busy disk."""
 
 
 @dataclass(slots=True)
@@ -68,8 +70,10 @@ class Watch:
         self._round_s = time.monotonic()
         self._rate_hz: float | None = None
         self._seen: dict[str, str] | None = None
-        self._missing: set[str] = set()
-        """Scans that left the folders and have a note."""
+        self._since = ""
+        """Time of the oldest scan that was looked at, where there are older ones."""
+        self._missing: dict[str, float] = {}
+        """Scans that left the folders, since when (monotonic seconds)."""
         self._spool_ns: tuple[int, ...] = ()
         self._stop = threading.Event()
         self._threads = [
@@ -212,24 +216,30 @@ class Watch:
         self._spool_ns = changed
         # No distances of a body are kept that may have been deleted.
         compare_surfaces.cache_clear()
-        found = {scan.scan_id: scan for scan in self._index.find(limit=_RECENT)}
+        scans = self._index.find(limit=_RECENT)
+        found = {scan.scan_id: scan for scan in scans}
         states = {scan_id: scan.state for scan_id, scan in found.items()}
         before, self._seen = self._seen, dict(states)
+        for scan_id in (before or {}).keys() - states.keys():
+            self._missing.setdefault(scan_id, time.monotonic())
+        # Where newer ones were deleted, older ones come into what is looked at.
+        since, self._since = self._since, scans[-1].created if len(scans) == _RECENT else ""
         for scan_id, state in states.items():
-            if before is not None and before.get(scan_id) != state:
+            if (
+                before is not None
+                and before.get(scan_id) != state
+                and found[scan_id].created >= since
+            ):
                 self._tell(found[scan_id])
-        missing = {*self._missing, *(before or {}).keys() - states.keys()}
-        self._missing, looked_for = set(), self._missing
-        for scan_id in missing:
+        for scan_id, since_s in list(self._missing.items()):
             if self._index.get(scan_id) is not None:
-                continue
-            if not self._spool.notes.path(ScanId(scan_id)).exists():
+                del self._missing[scan_id]
+            elif not self._spool.notes.path(ScanId(scan_id)).exists():
+                del self._missing[scan_id]
                 self._events.append("scan", {"scan_id": scan_id, "state": "deleted"})
-            elif scan_id in looked_for:
+            elif time.monotonic() - since_s > _DELETION_S:
+                del self._missing[scan_id]
                 self._events.append("scan", {"scan_id": scan_id, "state": "taken"})
-            else:
-                # A deletion removes the note in a moment.
-                self._missing.add(scan_id)
 
     def _tell(self, scan: ScanRecord) -> None:
         done = scan.state in ("delivered", "rescan", "failed")

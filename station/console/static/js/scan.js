@@ -189,7 +189,7 @@ export async function scan(main, session) {
           done.reasons.length && !cancelled ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
           done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: took })))),
       h('div', { className: 'actions' },
-        done.state === 'failed' ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
+        done.state === 'failed' || done.gone ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
         again,
         h('button', { id: 'next', onclick: () => { label = ''; ready(); document.getElementById('label').focus(); } }, t('scan.next'))),
       h('button', { id: 'go', hidden: true }));
@@ -214,6 +214,17 @@ export async function scan(main, session) {
     listing = setTimeout(latest, TOGETHER_MS);
   }
 
+  // Whether what is told of the last scan was deleted while nothing was heard.
+  async function still() {
+    const mine = current;
+    if (!mine || mine.state === 'failed' || !FINAL.includes(mine.state)) return;
+    try { await get(`/scans/${mine.scan_id}`); } catch (error) {
+      if (error.status !== 404 || mine !== current) return;
+      notice(t('scan.deleted'));
+      ready();
+    }
+  }
+
   async function look() {
     try {
       const told = await get('/booth');
@@ -234,12 +245,14 @@ export async function scan(main, session) {
     }
     const over = kind === 'scan' && ['failed', 'deleted', 'taken'].includes(data.state);
     if (over || ['job', 'result', 'reset', 'back'].includes(kind)) latestSoon();
+    if (kind === 'reset' || kind === 'back') still();
     if (!current || data.scan_id !== current.scan_id) return;
     if (kind === 'scan' && data.state === 'deleted') {
       notice(t('scan.deleted'));
       ready();
     } else if (kind === 'scan' && data.state === 'taken') {
       // The outcome stays, without its link.
+      current = { ...current, gone: true };
       document.getElementById('open')?.remove();
     } else if (kind === 'scan') {
       const { state: next, framesets, wanted, reason } = data;
