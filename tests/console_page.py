@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from live_console import PASSWORD, LiveConsole
@@ -14,6 +14,7 @@ from playwright.sync_api import (
     BrowserContext,
     Locator,
     Page,
+    TimeoutError,
     expect,
     sync_playwright,
 )
@@ -69,6 +70,17 @@ def log_in(page: Page, console: LiveConsole) -> None:
 
 def open_view(page: Page, console: LiveConsole, view: str) -> None:
     page.goto(f"{console.url}/#/{view}")
+
+
+def give_up_a_scan(page: Page) -> None:
+    """Begin a scan and cancel it; again where a busy machine's station did not begin one."""
+    for _ in range(5):
+        expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
+        page.click("#go")
+        with suppress(TimeoutError):
+            page.click("#give-up", timeout=10_000)
+            return
+    raise AssertionError("no scan was begun")
 
 
 def events_by_hand(page: Page, console: LiveConsole) -> None:

@@ -12,7 +12,15 @@ import time
 from typing import Any
 
 import pytest
-from console_page import LONG_MS, browser, four_pictures_move, log_in, open_view, tablet
+from console_page import (
+    LONG_MS,
+    browser,
+    four_pictures_move,
+    give_up_a_scan,
+    log_in,
+    open_view,
+    tablet,
+)
 from live_console import LiveConsole
 from playwright.sync_api import Route, expect
 
@@ -181,9 +189,7 @@ def test_another_language_says_the_same(console: LiveConsole) -> None:
         page = tablet(started).new_page()
         log_in(page, console)
         open_view(page, console, "scan")
-        expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
-        page.click("#go")
-        page.click("#give-up")
+        give_up_a_scan(page)
         ended = page.locator("#verdict h2")
         expect(ended).to_have_text("The scan was cancelled", timeout=LONG_MS)
         page.select_option("#language", "zh")
