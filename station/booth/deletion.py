@@ -164,7 +164,7 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
         if old:
             expire_old(spool, config.retention, deleted=deleted)
         else:
-            scans = [scan_id] if scan_id else [*map(str, labelled(spool, str(label)))]
+            scans: Sequence[str] = [scan_id] if scan_id else labelled(spool, str(label))
             if not scans:
                 raise NoScanError(
                     f"there is no scan with the label {label!r}; see station list; "

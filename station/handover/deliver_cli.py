@@ -104,8 +104,8 @@ class HandOver:
             wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
             for entry in self._ledger.follow(section.name, wanted, noted):
                 # Whoever took it, or deleted it, may not know who has not received it.
-                words = "scan %s left the outbox before it was handed over to %s"
                 if not self._spool.path("outbox", entry.scan_id).exists():
+                    words = "scan %s left the outbox before it was handed over to %s"
                     about = {"scan": entry.scan_id}
                     self._log.warning(words, entry.scan_id, entry.target, extra=about)
 
@@ -128,16 +128,18 @@ class HandOver:
 
     def try_all(self, name: str, now_s: float) -> None:
         """Hand over the results that are due to one target."""
-        for entry in self._ledger.waiting():
-            if entry.target == name and entry.due(now_s):
-                self._round_s[name] = time.monotonic()
-                received = self._try(entry, now_s)
-                self._settle(entry)
-                if received:
-                    # The others need not wait as long as after their own failures.
-                    for other in self._ledger.waiting():
-                        if other.target == name and not other.due(now_s):
-                            self._ledger.keep(replace(other, next_s=0.0))
+        mine = [entry for entry in self._ledger.waiting() if entry.target == name]
+        due = [entry for entry in mine if entry.due(now_s)]
+        received = False
+        for entry in due:
+            self._round_s[name] = time.monotonic()
+            received |= self._try(entry, now_s)
+            self._settle(entry)
+        if received:
+            # The others need not wait as long as after their own failures.
+            for entry in mine:
+                if entry not in due:
+                    self._ledger.keep(replace(entry, next_s=0.0))
 
     def _settle(self, entry: Waiting) -> None:
         """Wait for no result that is gone: what became of a try was recorded after that."""

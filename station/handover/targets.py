@@ -67,12 +67,10 @@ class FolderTarget:
                 shutil.rmtree(beside, ignore_errors=True)
                 raise
             fsync_folder(self._folder)
-        except shutil.Error as cause:
-            # Of each file: from where, to where, why not.
-            _, _, reason = cause.args[0][0]
-            raise HandOverError(f"{self._folder} cannot be written ({reason})") from None
         except OSError as cause:
-            reason = cause.strerror or cause
+            # That of a copy lists each file: from where, to where, why not.
+            several = isinstance(cause, shutil.Error)
+            reason = cause.args[0][0][2] if several else cause.strerror or cause
             raise HandOverError(f"{self._folder} cannot be written ({reason})") from None
 
 

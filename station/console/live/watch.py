@@ -150,6 +150,7 @@ class Watch:
                 if moved or now_s - looked_s > _LOOK_S:
                     looked_s = now_s
                     self._watch_spool(moved)
+                    self._watch_missing()
                     self._watch_silence(now_s)
                     self._problem = ""
             except (BoothError, OSError, zmq.ZMQError) as error:
@@ -210,7 +211,7 @@ class Watch:
         changed = tuple(
             (folder / place).stat().st_mtime_ns for place in PLACES if (folder / place).is_dir()
         )
-        settled = changed == self._spool_ns and not moved and not self._missing
+        settled = changed == self._spool_ns and not moved
         if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
             return
         self._spool_ns = changed
@@ -231,6 +232,9 @@ class Watch:
                 and found[scan_id].created >= since
             ):
                 self._tell(found[scan_id])
+
+    def _watch_missing(self) -> None:
+        """Tell what became of scans that left the folders."""
         for scan_id, since_s in list(self._missing.items()):
             if self._index.get(scan_id) is not None:
                 del self._missing[scan_id]
