@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from station.core.bundle import read_bundle
 from station.core.errors import InputError
@@ -148,6 +149,20 @@ def test_a_file_that_cannot_be_written_leaves_no_result(
     with pytest.raises(OSError, match=r"mesh\.obj"):
         reconstruct_bundle(bundle, tmp_path, model=model)
     assert not (tmp_path / "result.json").exists()
+
+
+def test_one_thread_of_blas_filters_too(
+    model: BodyModel, bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two waited for each other busily, and took a tenth of the processor time of a scan."""
+
+    def refused(*_: object) -> None:
+        blas = [library for library in threadpool_info() if library["user_api"] == "blas"]
+        raise InputError(f"threads: {sorted({library['num_threads'] for library in blas})}")
+
+    monkeypatch.setattr("workers.reconstruct.job.preprocess", refused)
+    with threadpool_limits(2, "blas"), pytest.raises(InputError, match=r"threads: \[1\]"):
+        reconstruct_bundle(bundle, tmp_path, model=model)
 
 
 @pytest.mark.parametrize("turn_deg", [180.0, -80.0])

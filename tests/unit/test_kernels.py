@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from station.simulation.scene import sphere
 from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
-from workers.scape.fit.initial import posed, starting_states
+from workers.scape.fit.initial import RoughPose, rotations_of, starting_states
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import (
     EdgeSolver,
@@ -173,6 +174,13 @@ def test_positions_alone_are_those_of_the_derivative(model: BodyModel) -> None:
         assert np.allclose(positions, samples.evaluate(state), atol=2e-6)
 
 
+def _standing(model: BodyModel, pose: RoughPose) -> NDArray[np.float64]:
+    """Mean body (P, 3) in a pose, with its soles on the floor."""
+    rotations = rotations_of(model, [pose])[0]
+    vertices = model.vertices(replace(model.neutral_state(), rotations=rotations))
+    return vertices - (0.0, 0.0, vertices[:, 2].min())
+
+
 @pytest.mark.parametrize(
     ("arms_deg", "heading_deg"),
     [((12.0, 12.0), 0.0), ((84.0, 84.0), 0.0), ((20.0, 75.0), -12.0)],
@@ -180,9 +188,7 @@ def test_positions_alone_are_those_of_the_derivative(model: BodyModel) -> None:
 def test_the_start_has_the_arms_where_the_cloud_has_them(
     model: BodyModel, arms_deg: tuple[float, float], heading_deg: float
 ) -> None:
-    state = posed(model, model.neutral_state(), arms_deg, (0.0, 0.0), np.radians(heading_deg))
-    vertices = model.vertices(state)
-    vertices[:, 2] -= vertices[:, 2].min()
+    vertices = _standing(model, (arms_deg, (0.0, 0.0), heading_deg))
     scout = SampledBody.build(model, np.arange(0, model.vertex_count, 53))
     cloud, _ = _skin_points(model, vertices, 800)
     best = model.vertices(starting_states(model, scout, cloud, cloud)[0])
@@ -193,9 +199,7 @@ def test_the_start_has_the_arms_where_the_cloud_has_them(
 
 def test_a_start_faces_the_other_way_for_toes_that_show_the_wrong_way(model: BodyModel) -> None:
     """A body half a metre off the mark, of whose feet little was seen, was fitted from behind."""
-    state = posed(model, model.neutral_state(), (20.0, 75.0), (0.0, 0.0), np.radians(10.0))
-    vertices = model.vertices(state)
-    vertices[:, 2] -= vertices[:, 2].min()
+    vertices = _standing(model, ((20.0, 75.0), (0.0, 0.0), 10.0))
     scout = SampledBody.build(model, np.arange(0, model.vertex_count, 53))
     cloud, _ = _skin_points(model, vertices, 800)
     toes_behind = cloud * (1.0, -1.0, 1.0)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _CELL_M = 0.04
 """Cell size of the height map."""
-_CLOSING = np.ones((5, 5), bool)
+_CLOSING = np.ones((5, 5), np.uint8)
 """Joins the front and the back of one head, whose crown no camera sees, but not two heads."""
 _LOWEST_LEVEL = 0.55
 """Lowest level that is searched for separate heads, as a share of the height."""
@@ -40,12 +40,14 @@ def count_people(points: Array) -> int:
     height = float(top.max())
     most = 1
     for level in np.arange(_LOWEST_LEVEL * height, height - _HEAD_M, _LEVEL_STEP_M):
-        labels, count = ndimage.label(ndimage.binary_dilation(top >= level, _CLOSING))
-        if count < 2:
+        joined = cv2.dilate((top >= level).astype(np.uint8), _CLOSING)
+        # The ground is a piece, too.
+        pieces, labels = cv2.connectedComponents(joined, connectivity=4)
+        if pieces <= 2:
             continue
         centers = [
             np.argwhere((labels == label) & (top >= level)).mean(axis=0) * _CELL_M
-            for label in range(1, count + 1)
+            for label in range(1, pieces)
             if _is_person(labels == label, top, level, cells, points[:, 2])
         ]
         most = max(most, _apart(centers))

@@ -89,10 +89,14 @@ class _Document(gltf.GLTF2):  # type: ignore[misc]
 def _set_fields(value: Any) -> Any:
     if isinstance(value, list):
         return [_set_fields(item) for item in value]
-    if not hasattr(value, "__dict__"):
+    fields = getattr(value, "__dict__", None)
+    if fields is None:
         return value
-    fields = {name: _set_fields(field) for name, field in vars(value).items() if name[0] != "_"}
-    return {name: field for name, field in fields.items() if field not in (None, [], {})}
+    return {
+        name: found
+        for name, field in fields.items()
+        if field is not None and name[0] != "_" and (found := _set_fields(field)) not in ([], {})
+    }
 
 
 class _File:

@@ -12,6 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.geometry import skew
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 Index = NDArray[np.intp]
@@ -175,7 +177,7 @@ def hull_order(points: Array, normal: Array) -> Index:
 def encloses(hull: Array, normal: Array, point: Array) -> bool:
     """Whether a convex polygon (n, 3), seen along its plane's normal, holds a point."""
     sides = np.roll(hull, -1, axis=0) - hull
-    turns = np.cross(sides, point - hull) @ normal
+    turns = np.einsum("ni,ni->n", sides @ skew(normal).T, point - hull)
     return bool((turns >= 0.0).all() or (turns <= 0.0).all())
 
 

@@ -119,11 +119,12 @@ def reconstruct_bundle(
         bundle = read_bundle(bundle_folder)
         model = model or load_model()
     progress("filtering", 0.0)
-    with watch.step("preprocess"):
-        scan = preprocess(bundle, volume)
-    return _fitted(
-        model, scan, Origin.of_bundle(bundle), method, out_folder, watch, progress, observer
-    )
+    with single_threaded_blas():
+        with watch.step("preprocess"):
+            scan = preprocess(bundle, volume)
+        return _fitted(
+            model, scan, Origin.of_bundle(bundle), method, out_folder, watch, progress, observer
+        )
 
 
 def reconstruct_cloud(
@@ -140,9 +141,10 @@ def reconstruct_cloud(
     watch = Stopwatch()
     with watch.step("load"):
         model = model or load_model()
-    with watch.step("preprocess"):
-        scan = Preprocessed(cloud, (), (*several_people(cloud), *roughness(cloud)))
-    return _fitted(model, scan, Origin(scan_id), method, out_folder, watch, progress, observer)
+    with single_threaded_blas():
+        with watch.step("preprocess"):
+            scan = Preprocessed(cloud, (), (*several_people(cloud), *roughness(cloud)))
+        return _fitted(model, scan, Origin(scan_id), method, out_folder, watch, progress, observer)
 
 
 def _fitted(
@@ -156,24 +158,23 @@ def _fitted(
     observer: Observer,
 ) -> JobSummary:
     """Fit, measure and write."""
-    with single_threaded_blas():
-        overlapping = fit_overlapping(model, scan, method, progress, observer)
-        progress("measuring", 0.0)
-        # Measuring does not depend on how limbs are separated.
-        with ThreadPoolExecutor(1) as beside:
-            measuring, standing = _measuring(beside, model, overlapping, scan.predicted, watch)
-            fit = separate_limbs(model, overlapping, scan.findings, observer)
-            watch.seconds.update(fit.seconds)
-            measured = measuring.result()
-            filing = beside.submit(surface_files, model, fit, measured, origin)
-            with watch.step("export"):
-                picture = picture_file(model, fit, measured, origin)
-            surface = filing.result()
-        progress("writing", 0.0)
-        write_result(
-            out_folder, model, fit, surface, picture, measured, standing.result(), origin, method,
-            watch,
-        )  # fmt: skip
+    overlapping = fit_overlapping(model, scan, method, progress, observer)
+    progress("measuring", 0.0)
+    # Measuring does not depend on how limbs are separated.
+    with ThreadPoolExecutor(1) as beside:
+        measuring, standing = _measuring(beside, model, overlapping, scan.predicted, watch)
+        fit = separate_limbs(model, overlapping, scan.findings, observer)
+        watch.seconds.update(fit.seconds)
+        measured = measuring.result()
+        filing = beside.submit(surface_files, model, fit, measured, origin)
+        with watch.step("export"):
+            picture = picture_file(model, fit, measured, origin)
+        surface = filing.result()
+    progress("writing", 0.0)
+    write_result(
+        out_folder, model, fit, surface, picture, measured, standing.result(), origin, method,
+        watch,
+    )  # fmt: skip
     progress("done", 1.0)
     evidence = None
     if overlapping.evidence is not None and fit.verdict.status == "ok":

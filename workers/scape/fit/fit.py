@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from workers.cloud.observed import Finding, PointCloud, Preprocessed, check_shows_a_body
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
@@ -146,12 +147,19 @@ def fit_body(
         return separate_limbs(model, overlapping, scan.findings, observer)
 
 
-def single_threaded_blas() -> threadpool_limits:
+def single_threaded_blas() -> AbstractContextManager[object]:
     """Limit BLAS to one thread, so that the order of its sums and therefore every bit is the same.
 
-    The other core is used by threads that run beside it.
+    The other core is used by threads that run beside it; more threads of BLAS would wait for each
+    other busily.
     """
-    return threadpool_limits(limits=1, user_api="blas")
+    return _libraries().limit(limits=1, user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> ThreadpoolController:
+    """The libraries for linear algebra, which are found once: a search takes milliseconds."""
+    return ThreadpoolController()
 
 
 def fit_overlapping(

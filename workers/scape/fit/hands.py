@@ -222,7 +222,7 @@ class _Tries:
         still, change = (found.astype(np.float64) for found in hand.body.arms(state, own))
         turns = state.rotations[others]
         rest = np.einsum("pij,npj->ni", turns, still[:, others])
-        rest_change = np.einsum("pij,npjck->nick", turns, change[:, others])
+        rest_change = np.einsum("pij,npjck->nick", turns, change[:, others], optimize=True)
         members = tuple(np.flatnonzero(hand.owner == part) for part in own)
         local = np.empty_like(normals)
         for part, mine in zip(own, members, strict=True):

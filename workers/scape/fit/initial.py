@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -55,37 +56,26 @@ _TRUNK_HEIGHTS = (0.35, 0.75)
 """Heights of the trunk, as shares of the stature."""
 _MIN_TRUNK_POINTS = 50
 
-_Try = tuple[tuple[float, float], tuple[float, float], float]
-"""Degrees: arms from the trunk (left, right), arms swung back (left, right), heading."""
+RoughPose = tuple[tuple[float, float], tuple[float, float], float]
+"""Degrees: angles of the arms from the trunk (left, right) and behind it (left, right), and the
+rotation about the vertical."""
 
 
-def posed(
-    model: BodyModel,
-    state: BodyState,
-    arm_deg: tuple[float, float],
-    swing_deg: tuple[float, float],
-    heading_deg: float,
-) -> BodyState:
-    """State with other arms and another heading.
-
-    Args:
-        arm_deg: angles of the arms from the trunk (left, right).
-        swing_deg: angles of the arms behind the trunk (left, right).
-        heading_deg: rotation about the vertical.
-    """
+def rotations_of(model: BodyModel, poses: Sequence[RoughPose]) -> Array:
+    """Rotations (c, L, 3, 3) of the parts in rough poses."""
     names = list(model.part_names)
-    twists = np.zeros((model.part_count, 3))
-    twists[0, 2] = np.radians(heading_deg)
-    for side, sign, angle, swing in zip(
-        ("left", "right"), (1.0, -1.0), arm_deg, swing_deg, strict=True
-    ):
-        lower = sign * np.radians(_NEUTRAL_ARM_DEG - angle)
-        twists[names.index(f"shoulder_{side}"), 1] = _GIRDLE_SHARE * lower
-        twists[names.index(f"upper_arm_{side}"), 0] = np.radians(swing)
-        twists[names.index(f"upper_arm_{side}"), 1] = (1.0 - _GIRDLE_SHARE) * lower
+    arms_deg, swings_deg, headings_deg = map(np.array, zip(*poses, strict=True))
+    twists = np.zeros((len(poses), model.part_count, 3))
+    twists[:, 0, 2] = np.radians(headings_deg)
+    for index, (side, sign) in enumerate((("left", 1.0), ("right", -1.0))):
+        upper_arm = names.index(f"upper_arm_{side}")
+        lower = sign * np.radians(_NEUTRAL_ARM_DEG - arms_deg[:, index])
+        twists[:, names.index(f"shoulder_{side}"), 1] = _GIRDLE_SHARE * lower
+        twists[:, upper_arm, 0] = np.radians(swings_deg[:, index])
+        twists[:, upper_arm, 1] = (1.0 - _GIRDLE_SHARE) * lower
         straighter = np.array([0.7, 0.1 * sign, 0.7 * sign]) * _STRAIGHTER_ELBOW_RAD
-        twists[names.index(f"forearm_{side}")] = straighter
-    return replace(state, rotations=model.absolute_rotations(twists))
+        twists[:, names.index(f"forearm_{side}")] = straighter
+    return model.absolute_rotations(twists)
 
 
 def stature_beta(model: BodyModel, stature_m: float) -> Array:
@@ -145,9 +135,13 @@ def starting_states(
     # The pose-dependent deformation is neglected here.
     arms, _ = scout.arms(state, ())
 
-    def scored(tried: list[_Try]) -> tuple[Array, list[BodyState]]:
-        states = [posed(model, state, *one) for one in tried]
-        bodies, states = _placed(model, scout, arms, states, center)
+    def scored(tried: list[RoughPose]) -> tuple[Array, list[BodyState]]:
+        rotations = rotations_of(model, tried)
+        bodies, shifts = _placed(model, scout, arms, rotations, center)
+        states = [
+            replace(state, rotations=turns, translation=shift)
+            for turns, shift in zip(rotations, shifts, strict=True)
+        ]
         return _costs(bodies, points), states
 
     straight = (0.0, 0.0)
@@ -194,19 +188,15 @@ def _placed(
     model: BodyModel,
     scout: SampledBody,
     arms: NDArray[np.float32],
-    states: list[BodyState],
+    rotations: Array,
     center: Array,
-) -> tuple[Array, list[BodyState]]:
-    """Bodies (c, n, 3) at the center of the cloud, soles on the floor, and their states."""
-    rotations = np.stack([state.rotations for state in states])
+) -> tuple[Array, Array]:
+    """Bodies (c, n, 3) at the center of the cloud, soles on the floor, and their shifts (c, 3)."""
     bodies = np.einsum("cpij,npj->cni", rotations, arms.astype(np.float64), optimize=True)
     trunk = np.isin(model.part_of_vertex[scout.indices], (0, 1, 2))
     shift = center - np.median(bodies[:, trunk], axis=1)
     shift[:, 2] = -bodies[:, :, 2].min(axis=1)
-    placed = [
-        replace(state, translation=offset) for state, offset in zip(states, shift, strict=True)
-    ]
-    return bodies + shift[:, None], placed
+    return bodies + shift[:, None], shift
 
 
 def _costs(bodies: Array, points: Array) -> Array:

@@ -32,6 +32,8 @@ class Sampling:
     """The first of these vertices: the surface in the coarse steps."""
     normals: Array
     """(m, 3): normals of the coarse body's vertices on the mean body."""
+    weights: Array
+    """(m, L): shares of the parts in these vertices."""
     share: Array
     """(m,): area that each of them represents, in units of an average vertex's."""
     coarse_sample: NDArray[np.intp]
@@ -52,6 +54,7 @@ class Sampling:
             body,
             body.first(_COARSE_PLACES),
             vertex_normals(model.mean, model.faces)[order[:_COARSE_PLACES]],
+            model.vertex_weights[order[:_COARSE_PLACES]],
             np.bincount(coarse_of_vertex, model.vertex_shares, _COARSE_PLACES).astype(np.float64),
             cKDTree(places[:COARSE_SAMPLES]).query(coarse)[1],
             cKDTree(places).query(model.mean)[1],
@@ -60,13 +63,12 @@ class Sampling:
 
     def coarse_skin(self, model: BodyModel, state: BodyState) -> Skin:
         """Skin of the coarse steps; its normals are rotated with the parts."""
-        index = self.coarse_body.indices
-        turns = model.vertex_weights[index] @ state.rotations.reshape(-1, 9)
+        turns = self.weights @ state.rotations.reshape(-1, 9)
         normals = np.einsum("nij,nj->ni", turns.reshape(-1, 3, 3), self.normals)
         return Skin(
             self.coarse_body.evaluate(state),
             normals / np.linalg.norm(normals, axis=1, keepdims=True),
-            model.part_of_vertex[index],
+            model.part_of_vertex[self.coarse_body.indices],
             self.share,
             self.coarse_sample,
         )

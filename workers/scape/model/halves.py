@@ -1,9 +1,13 @@
-"""Work in a second thread: the order of each item's sums stays the same."""
+"""Work in a second thread: the order of each item's sums stays the same.
+
+Threads are kept, since to start one takes as long as a small half.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -14,6 +18,8 @@ Result = TypeVar("Result")
 
 WORTH_A_THREAD = 5000
 """Number of items from which a second thread saves time."""
+_MOST_THREADS = 32
+"""Far more than calls that wait for each other, so that none waits for a thread."""
 
 
 def in_halves(
@@ -22,17 +28,18 @@ def in_halves(
     """Arrays that `work` gives for a range of `count` items, from one range or two."""
     if count <= WORTH_A_THREAD:
         return work(slice(0, count))
-    with ThreadPoolExecutor(1) as beside:
-        second = beside.submit(work, slice(count // 2, count))
-        first = work(slice(0, count // 2))
-        return tuple(np.concatenate(parts) for parts in zip(first, second.result(), strict=True))
+    second = started(work, slice(count // 2, count))
+    first = work(slice(0, count // 2))
+    return tuple(np.concatenate(parts) for parts in zip(first, second.result(), strict=True))
 
 
 def started(
     work: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> Future[Result]:
-    """Result of a call in a thread of its own, which nothing waits for but who asks for it."""
-    beside = ThreadPoolExecutor(1)
-    found = beside.submit(work, *args, **kwargs)
-    beside.shutdown(wait=False)
-    return found
+    """Result of a call in another thread, which nothing waits for but who asks for it."""
+    return _threads().submit(work, *args, **kwargs)
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_MOST_THREADS)
