@@ -17,7 +17,8 @@ from station.core.bundle import read_bundle
 from station.simulation.scene import bumped, load_mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
-from workers.scape.fit.fit import fit_overlapping, single_threaded_blas
+from workers.scape.fit.fit import fit_overlapping
+from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import load_model
 
 BODY = Path(__file__).parents[2] / "station/simulation/bodies/ben.npz"

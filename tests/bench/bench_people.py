@@ -23,9 +23,10 @@ from station.simulation.scene import bumped, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import warm_up
-from workers.scape.fit.fit import fit_overlapping, separate_limbs, single_threaded_blas
+from workers.scape.fit.fit import fit_overlapping, separate_limbs
 from workers.scape.fit.observer import unobserved
 from workers.scape.learn.database import BodyDatabase
+from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]

@@ -24,9 +24,10 @@ from workers.cloud.preprocess import preprocess
 from workers.measure.body import MeasuredBody, measure_body
 from workers.measure.definitions import DEFINITIONS
 from workers.reconstruct.job import scan_errors
-from workers.scape.fit.fit import fit_overlapping, separate_limbs, single_threaded_blas
+from workers.scape.fit.fit import fit_overlapping, separate_limbs
 from workers.scape.fit.observer import unobserved
 from workers.scape.learn.database import BodyDatabase, Shapes
+from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]

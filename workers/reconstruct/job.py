@@ -37,10 +37,10 @@ from workers.scape.fit.fit import (
     fit_body,
     fit_overlapping,
     separate_limbs,
-    single_threaded_blas,
 )
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.unmatched import patch_sigma_m
+from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions

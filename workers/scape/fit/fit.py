@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 from workers.cloud.observed import Finding, PointCloud, Preprocessed, check_shows_a_body
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
@@ -44,6 +42,7 @@ from workers.scape.fit.verdict import (
     sides_seen,
     unexplained_share,
 )
+from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.halves import started
@@ -147,21 +146,6 @@ def fit_body(
         return separate_limbs(model, overlapping, scan.findings, observer)
 
 
-def single_threaded_blas() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread, so that the order of its sums and therefore every bit is the same.
-
-    The other core is used by threads that run beside it; more threads of BLAS would wait for each
-    other busily.
-    """
-    return _libraries().limit(limits=1, user_api="blas")
-
-
-@lru_cache(maxsize=1)
-def _libraries() -> ThreadpoolController:
-    """The libraries for linear algebra, which are found once: a search takes milliseconds."""
-    return ThreadpoolController()
-
-
 def fit_overlapping(
     model: BodyModel, scan: Preprocessed, method: Method, progress: Progress, observer: Observer
 ) -> OverlappingFit:
@@ -176,13 +160,8 @@ def fit_overlapping(
     start = time.monotonic()
     progress("aligning", 0.0)
     sampling = sampling_of(model)
-    few_samples = sampling.body.first(_START_SAMPLES)
     most_points = len(cloud) if method == "paper" else _JOINT_POINTS
-    few = cloud.points[even_subset(len(cloud), _START_POINTS)]
-    with ThreadPoolExecutor(1) as beside:
-        building = beside.submit(Target.build, cloud, scan.views, most_points)
-        starts = starting_states(model, few_samples, few, cloud.points[::_FACING_EVERY])
-        target = building.result()
+    target, starts = _prepared(model, sampling, scan, most_points)
     if observer is not unobserved:
         observer("start", {"vertices": model.vertices(starts[0])})
     aligned = time.monotonic()
@@ -226,6 +205,18 @@ def fit_overlapping(
             "optimise": time.monotonic() - fitted,
         },
     )
+
+
+def _prepared(
+    model: BodyModel, sampling: Sampling, scan: Preprocessed, most_points: int
+) -> tuple[Target, list[BodyState]]:
+    """The cloud prepared for the search of correspondences, and starting states, best first."""
+    points = scan.cloud.points
+    few = points[even_subset(len(points), _START_POINTS)]
+    building = started(Target.build, scan.cloud, scan.views, most_points)
+    scout = sampling.body.first(_START_SAMPLES)
+    starts = starting_states(model, scout, few, points[::_FACING_EVERY])
+    return building.result(), starts
 
 
 def separate_limbs(

@@ -18,7 +18,6 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from workers.scape.evidence.cameras import CameraCorrections, CameraEvidence
-from workers.scape.evidence.correspondence import TrackedPoints
 from workers.scape.evidence.rows import CameraTerms
 from workers.scape.fit.annealing import AnnealingStep
 from workers.scape.fit.gauss_newton import (
@@ -86,12 +85,7 @@ def fit_jointly(
         progress: called with the share of the steps that are done.
     """
     prior = TwistPrior.build(model, _THUMB_STIFFNESS)
-    subset = target.subset
-    tracked = TrackedPoints(
-        model.neighbours,
-        np.concatenate([target.tree.points[subset], target.rims.points]),
-        np.concatenate([target.tree.normals[subset], target.rims.normals]),
-    )
+    tracked = target.tracked(model)
     terms: DataTerms | None = None
     evidence: Callable[[], CameraEvidence] | None = None
     # Terms that do not depend on each other are computed here and in one thread beside.

