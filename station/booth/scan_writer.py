@@ -10,7 +10,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -71,6 +71,8 @@ class ScanWriter:
         self._thread = threading.Thread(target=self._run, name="scan writer", daemon=True)
         self._thread.start()
         self._tasks.put(self._settle_abandoned)
+        if config.drift.refuse_scans:
+            self._tasks.put(partial(self._prepare_check, self._names))
 
     def begin(self, order: Order) -> None:
         """Record that an order is started; `Started` or `Ended` follows."""
@@ -188,6 +190,20 @@ class ScanWriter:
             extra={"scan": order.scan_id},
         )
         self._end(order.scan_id, True, "")
+
+    def _prepare_check(self, cameras: Sequence[str]) -> None:
+        """Prepare the check for moved cameras, which the first scan would wait a second for.
+
+        One camera a task, so that an order that comes meanwhile waits for one.
+        """
+        if not cameras:
+            return
+        self._begun_s = None  # no disk is waited for
+        try:
+            self._drift.prepare(booth_rig(self._config).cameras[cameras[0]])
+        except (BoothError, OSError):
+            return  # a scan will say why
+        self._tasks.put(partial(self._prepare_check, cameras[1:]))
 
     def _refuse_moved_cameras(self, collection: Collection) -> None:
         """A scan with a wrong calibration is useless: report it while the person is still there.

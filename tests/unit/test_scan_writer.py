@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 import time
 import weakref
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +80,31 @@ def test_a_long_check_for_moved_cameras_is_no_slow_disk(one_camera: BoothConfig)
         assert _events(writer)
     finally:
         check.end.set()
+        writer.close()
+
+
+class _Prepared(DriftWatch):
+    """A check that notes which cameras it was prepared for."""
+
+    def __init__(self, store: CalibrationStore) -> None:
+        super().__init__(store)
+        self.cameras: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def prepare(self, camera: CameraCalibration) -> None:
+        self.cameras.put(camera.name)
+        super().prepare(camera)
+
+
+def test_the_check_for_moved_cameras_is_prepared_before_a_scan(one_camera: BoothConfig) -> None:
+    """The first scan after a start waited for it, a second with four cameras."""
+    store, rig = CalibrationStore.of(one_camera), default_rig()
+    alone = {"front-lower": rig.cameras["front-lower"]}
+    replace(rig, cameras=alone, reference="front-lower").save(store.in_use)
+    check = _Prepared(store)
+    writer = ScanWriter(one_camera, check, logging.getLogger())
+    try:
+        assert check.cameras.get(timeout=20.0) == "front-lower"
+    finally:
         writer.close()
 
 

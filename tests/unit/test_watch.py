@@ -15,6 +15,7 @@ import pytest
 
 from station.calibration.detect.scene import static_view
 from station.calibration.drift.motion import QUIET_M, CameraMove
+from station.calibration.drift.reference import DriftReference
 from station.calibration.drift.watch import Doubts, DriftWatch
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
@@ -52,6 +53,22 @@ def test_another_calibration_brings_its_own_empty_booth(store: CalibrationStore)
     [move] = watch.moves(CAMERA, _frames(30000), 1e-4)
     assert not move.moved
     assert not move.lost
+
+
+def test_what_is_prepared_is_not_prepared_by_a_scan(
+    store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first scan of a day waited for it, a second with four cameras."""
+    store.use("20261101T100000Z")
+    watch = DriftWatch(store)
+    watch.prepare(CAMERA)
+    watch.prepare(default_rig().cameras["back-upper"])  # nothing was stored of it
+    with monkeypatch.context() as again:
+        again.delattr(DriftReference, "prepare")
+        assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+    store.use("20261102T100000Z")
+    [move] = watch.moves(CAMERA, _frames(30000), 1e-4)
+    assert not move.moved
 
 
 def test_images_of_another_size_are_refused(store: CalibrationStore) -> None:

@@ -54,6 +54,16 @@ class DriftWatch:
         """Whether a scan is to be refused for a move; each scan's is asked for once, in order."""
         return self._doubts.confirmed(move)
 
+    def prepare(self, camera: CameraCalibration) -> None:
+        """Prepare the check of a camera, a quarter of a second, before a scan waits for it.
+
+        Raises:
+            CalibrationError: the calibration's empty booth cannot be read.
+        """
+        self._follow()
+        if camera.name in self._views and camera.name not in self._references:
+            self._references[camera.name] = DriftReference.prepare(camera, self._views[camera.name])
+
     def moves(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
     ) -> list[CameraMove]:
@@ -63,7 +73,7 @@ class DriftWatch:
             CalibrationError: the calibration's empty booth cannot be read, or the camera's images
                 are of another size than when it was calibrated.
         """
-        self._follow()
+        self.prepare(camera)
         view = self._views.get(camera.name)
         if view is None:
             return []
@@ -73,8 +83,6 @@ class DriftWatch:
                 f"camera {camera.name} gives images of {width} x {height}, not those that it was "
                 "calibrated with; run station calibrate"
             )
-        if camera.name not in self._references:
-            self._references[camera.name] = DriftReference.prepare(camera, view)
         return [estimate_move(self._references[camera.name], frames, scale_m)]
 
     def _follow(self) -> None:
