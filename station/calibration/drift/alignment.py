@@ -10,6 +10,7 @@ it under priors, for the whole image and for each block of it, so that the covar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -174,25 +175,26 @@ def _solved(
     border = 6 + COMMON
     design, edges = samples.design, [*samples.starts, len(off)]
     weighted = design * weights[:, None]
-    information, gradient = np.zeros((len(local), border, border)), np.zeros(border)
-    gradient[:6] = -prior[:6] * xi
-    eliminated = []
-    for index, (start, end, known) in enumerate(zip(edges[:-1], edges[1:], local, strict=True)):
-        mine = slice(start, end)
-        normal, right = design[mine].T @ weighted[mine], weighted[mine].T @ off[mine]
-        inner = normal[border:, border:] + np.diag(known)
-        solved = np.linalg.solve(inner, np.column_stack([normal[border:, :border], right[border:]]))
-        information[index] = normal[:border, :border]
-        information[index] -= normal[:border, border:] @ solved[:, :border]
-        gradient += right[:border] - normal[:border, border:] @ solved[:, border]
-        eliminated.append(solved)
+    count, size = len(local), design.shape[1]
+    normal, right = np.empty((count, size, size)), np.empty((count, size, 1))
+    for block, (start, end) in enumerate(pairwise(edges)):
+        normal[block] = design[start:end].T @ weighted[start:end]
+        right[block, :, 0] = weighted[start:end].T @ off[start:end]
+    inner = normal[:, border:, border:] + local[:, None] * np.eye(LOCAL)
+    solved = np.linalg.solve(
+        inner, np.concatenate([normal[:, border:, :border], right[:, border:]], axis=2)
+    )
+    left = np.concatenate([normal[:, :border, :border], right[:, :border]], axis=2)
+    left -= normal[:, :border, border:] @ solved
+    information, gradient = left[:, :, :border], left[:, :, border].sum(axis=0)
+    gradient[:6] -= prior[:6] * xi
     change: Array = np.asarray(
         np.linalg.solve(information.sum(axis=0) + np.diag(prior), gradient), np.float64
     )
+    owns = solved[:, :, border] - solved[:, :, :border] @ change
+    of_samples = np.repeat(owns, np.diff(edges), axis=0)
     explained = design[:, 6:border] @ change[6:]
-    owns = np.array([solved[:, border] - solved[:, :border] @ change for solved in eliminated])
-    for start, end, own in zip(edges[:-1], edges[1:], owns, strict=True):
-        explained[start:end] += design[start:end, border:] @ own
+    explained += np.einsum("ni,ni->n", design[:, border:], of_samples)
     return change[:6], information, explained, owns
 
 
