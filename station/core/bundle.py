@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import shutil
 from collections.abc import Mapping, Sequence
@@ -16,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.png import image_of_png, png_of, png_size
-from station.core.errors import BundleError, BundleReadError, CalibrationError
-from station.core.files import private_folder, read_json, read_regular, write_json
+from station.core.errors import BundleError, CalibrationError, DiskReadError
+from station.core.files import OF_THE_DISK, private_folder, read_json, read_regular, write_json
 from station.core.rig import Rig
 
 FORMAT = "booth-bundle"
@@ -25,8 +24,6 @@ VERSIONS = frozenset({1})
 MANIFEST = "bundle.json"
 CALIBRATION = "calibration.json"
 _ENCODERS = 2
-_OF_THE_DISK = (errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""Reasons that are no file's own and may pass."""
 _PNG_SLACK_BYTES = 1 << 16
 """Allowance beyond twice the pixels' own size, which not even a PNG of noise reaches."""
 MAX_CAMERAS, MAX_FRAMES = 64, 1000
@@ -73,7 +70,7 @@ class Bundle:
 
         Raises:
             BundleError: the file is missing, torn, or not a 16-bit image of the camera's size.
-            BundleReadError: the disk refuses.
+            DiskReadError: the disk refuses.
         """
         path = self.folder / record.file
         # Only links of the bundle itself: the spool may well lie behind one.
@@ -86,7 +83,7 @@ class Bundle:
         try:
             data = read_regular(path, most_bytes)
         except OSError as cause:
-            kind = BundleReadError if cause.errno in _OF_THE_DISK else BundleError
+            kind = DiskReadError if cause.errno in OF_THE_DISK else BundleError
             raise kind(f"{path} cannot be read ({cause.strerror}); scan again") from None
         except ValueError as cause:
             raise BundleError(f"{path} {cause}; scan again") from None
@@ -116,6 +113,7 @@ def read_bundle(folder: Path) -> Bundle:
     Raises:
         FormatError: a file is missing, torn, of an unknown version, or contradicts the others;
             the message names it.
+        DiskReadError: the disk refuses.
         CalibrationError: a camera of the bundle is not in its calibration.
     """
     path = folder / MANIFEST

@@ -19,12 +19,12 @@ class FormatError(BoothError):
     """A file is torn, of another kind or of a version that this program does not read."""
 
 
+class DiskReadError(FormatError):
+    """The disk refused to read a file, which says nothing of its content: it may read it later."""
+
+
 class BundleError(FormatError):
     """A scan bundle is incomplete or contradicts itself."""
-
-
-class BundleReadError(BundleError):
-    """The disk refused to read a bundle, which says nothing of the scan: it may read it later."""
 
 
 class CalibrationError(BoothError):

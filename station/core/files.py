@@ -16,11 +16,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from station.core.errors import BoothError, FormatError
+from station.core.errors import BoothError, DiskReadError, FormatError
 
 PRIVATE_FOLDER_MODE = 0o700
 """Body scans are personal data: only the service's user may read them."""
 PRIVATE_FILE_MODE = 0o600
+OF_THE_DISK = (errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Reasons why a file cannot be read that are not its own and may pass."""
 _LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
 MAX_JSON_BYTES = 16 << 20
 """A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
@@ -252,12 +254,17 @@ def read_json(
         FormatError (or the subclass ``error``): the file is missing, torn, too large, a link, of
             another format, or of a version not in ``versions``; the message names the file and
             what was found.
+        DiskReadError: the disk refuses.
     """
     try:
         document = read_bounded_json(path, MAX_JSON_BYTES)
     except FileNotFoundError:
         raise error(f"{path} is missing; a {format} file was expected there") from None
     except (OSError, ValueError) as cause:
+        if isinstance(cause, OSError) and cause.errno in OF_THE_DISK:
+            raise DiskReadError(
+                f"{path} cannot be read ({cause.strerror}); check its disk"
+            ) from None
         raise error(
             f"{path} cannot be read as JSON ({cause}); restore it from its source"
         ) from None

@@ -22,7 +22,7 @@ import os, signal
 from pathlib import Path
 import numpy as np
 import workers.reconstruct.job as job
-from station.core.errors import BundleReadError
+from station.core.errors import DiskReadError
 from workers.reconstruct.job_process import main
 
 def reconstruct(bundle, out, progress, **_):
@@ -59,7 +59,7 @@ def _outcome(folder: Path, monkeypatch: pytest.MonkeyPatch, act: str) -> Outcome
         ("np.ones(10 << 27)", "job", "more than 2048 MB"),
         ("raise OSError(28, 'No space left on device')", "disk", "No space left"),
         ("raise ValueError('Out of range float values: nan')", "job", "ValueError"),
-        ("raise BundleReadError('000.png cannot be read; scan again')", "job", "000.png"),
+        ("raise DiskReadError('000.png cannot be read; scan again')", "job", "000.png"),
     ],
 )
 def test_an_end_without_a_result_has_a_cause(

@@ -9,7 +9,8 @@ import pytest
 
 from station.core.bundle import CapturedFrame, read_bundle, write_bundle
 from station.core.depth.correction import DepthCorrection
-from station.core.errors import BundleError, BundleReadError, CalibrationError, FormatError
+from station.core.errors import BundleError, CalibrationError, DiskReadError, FormatError
+from station.core.files import read_regular
 from station.core.rig import CameraCalibration, Rig
 
 
@@ -77,9 +78,27 @@ def test_a_disk_that_refuses_is_not_the_scans_fault(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("station.core.bundle.read_regular", refused)
-    with pytest.raises(BundleError, match="cannot be read") as raised:
+    with pytest.raises(FormatError, match="cannot be read") as raised:
         bundle.read_frame(camera, frames[0])
-    assert isinstance(raised.value, BundleReadError) == of_the_disk
+    assert isinstance(raised.value, DiskReadError) == of_the_disk
+
+
+@pytest.mark.parametrize("name", ["bundle.json", "calibration.json"])
+@pytest.mark.parametrize(("number", "of_the_disk"), [(errno.EIO, True), (errno.EACCES, False)])
+def test_neither_is_one_that_refuses_a_description(
+    bundle_folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, number: int, of_the_disk: bool
+) -> None:
+    """A scan whose manifest could not be read failed at once, for good."""
+
+    def read_except(path: Path, most_bytes: int) -> bytes:
+        if path.name == name:
+            raise OSError(number, os.strerror(number))
+        return read_regular(path, most_bytes)
+
+    monkeypatch.setattr("station.core.files.read_regular", read_except)
+    with pytest.raises(FormatError, match=rf"{name} cannot be read") as raised:
+        read_bundle(bundle_folder)
+    assert isinstance(raised.value, DiskReadError) == of_the_disk
 
 
 def test_a_missing_frame_is_named(bundle_folder: Path) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from station.core.config import Volume
-from station.core.errors import BoothError, BundleReadError
+from station.core.errors import BoothError, DiskReadError
 from station.core.service import die_with_parent, set_up_caches
 
 MEMORY_BYTES = 2 << 30
@@ -58,7 +58,7 @@ def main() -> None:
             model=model,
             progress=lambda step, share: _say(channel, {"step": step, "share": share}),
         )
-    except BundleReadError as error:
+    except DiskReadError as error:
         # Tried again like a job that died: waiting for the disk, all other scans would wait for
         # one bad sector.
         _say(channel, {"died": str(error)})
