@@ -54,7 +54,7 @@ test-console:
 	$(BIN)/python -m pytest -s -v tests/console/page_in_browser.py tests/console/calibration_in_browser.py
 test-console-long:
 	CONSOLE_CASES=200 $(BIN)/python -m pytest -s tests/console/generated_requests.py
-	CONSOLE_GUESSES=10000 $(BIN)/python -m pytest tests/console/test_security.py -k wrong_passwords
+	CONSOLE_GUESSES=10000 $(BIN)/python -m pytest tests/console/test_crooked_requests.py -k wrong_passwords
 
 $(VENV)/chromium.stamp: deploy/install-system.sh deploy/apt-packages-test.txt
 	sh deploy/install-system.sh $(PYTHON) deploy/apt-packages-test.txt

@@ -17,7 +17,10 @@ BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 
 _TOGETHER = (
     [f"tests/accuracy/test_{name}.py" for name in ("bars", "model_accuracy", "unlike")],
-    [f"tests/console/test_{name}.py" for name in ("api", "attacks", "exports", "page", "security")],
+    [
+        f"tests/console/test_{name}.py"
+        for name in ("api", "attacks", "crooked_requests", "exports", "page", "security")
+    ],
 )
 """Files that share what takes half a minute to make: the database of bodies; a station's scans."""
 

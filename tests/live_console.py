@@ -29,6 +29,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def problem_status(answer: httpx.Response) -> int:
+    """Status of an answer that has to be a problem document."""
+    assert answer.headers["content-type"].startswith("application/problem+json"), answer.text
+    return answer.status_code
+
+
 class LiveConsole:
     """A station with a console, a password and tokens of every scope.
 

@@ -1,4 +1,5 @@
-"""One station with a console for all tests of this folder; it ends with the last of them."""
+"""One station with a console for all tests of this folder, which ends with the last of them; and
+a spool without a station."""
 
 from __future__ import annotations
 
@@ -9,6 +10,10 @@ from typing import Any
 
 import pytest
 from live_console import LiveConsole
+
+from station.core.files import write_json
+from station.core.scans import REASON
+from station.core.spool import Spool
 
 
 @pytest.fixture(scope="package")
@@ -43,3 +48,40 @@ def in_shanghai(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         time.tzset()
         yield
     time.tzset()
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    """Spool of four scans: one waits, one has failed, two are delivered."""
+    spool = Spool(tmp_path / "spool")
+    for number, (place, label) in enumerate(
+        [
+            ("queue", "Order 7"),
+            ("outbox", "Order 1234"),
+            ("failed", "ÅNGSTRÖM"),
+            ("outbox", "訂單 9"),
+        ]
+    ):
+        folder = spool.path(place, f"2026112{number}T100000Z-000{number}")
+        folder.mkdir()
+        document: dict[str, object] = {
+            "label": label,
+            "created": f"2026-11-2{number}T10:00:00Z",
+            "booth": "b",
+        }
+        if place == "outbox":
+            document |= {"status": "ok" if number == 1 else "rescan", "reasons": ["arm"]}
+            write_json(folder / "result.json", document)
+        else:
+            write_json(folder / "bundle.json", document)
+        if place == "failed":
+            write_json(folder / REASON, {"reason": "nobody there"})
+    return spool
+
+
+@pytest.fixture
+def option(spool: Spool) -> list[str]:
+    """Option that names the configuration of a booth with this spool."""
+    config = spool.folder.parent / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    return ["--config", str(config)]

@@ -1,58 +1,32 @@
-"""The table of measurements on bodies of the model itself: no fit, no noise."""
+"""Table of measurements on bodies of the model itself: no fit, no noise."""
 
-import json
 from dataclasses import replace
-from importlib.resources import files
 
 import numpy as np
 import pytest
+from random_bodies import random_body
 from true_measurements import TrueBody
 
-from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from station.core.words.terms import TERMS
-from workers.export.origin import Origin
-from workers.export.result import measurements_document
-from workers.measure.body import measure_body, measure_standing
-from workers.measure.coverage import SeenSkin
+from workers.measure.body import measure_body
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.differences import side_differences
 from workers.measure.intervals import (
-    SHIPPED,
-    ErrorModel,
-    RowErrors,
-    ScanErrors,
-    learned,
     shipped,
     sides_pooled,
 )
-from workers.measure.kinds import TRUNK_ENDS, Route, Section
+from workers.measure.kinds import Route, Section
 from workers.measure.sections import loop_length
-from workers.measure.standing import on_both_feet, standard_state, stood_upright
+from workers.measure.standing import on_both_feet, standard_state
 from workers.measure.tracing import trace_all
 from workers.scape.learn.landmarks import landmarks
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
-from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.body_model import BodyModel, load_model
 
 
 @pytest.fixture(scope="module")
 def model() -> BodyModel:
     return load_model()
-
-
-def _body(model: BodyModel, seed: int = 0, pose_deg: float = 5.0) -> tuple[BodyState, np.ndarray]:
-    """A random body near the neutral pose, on the floor."""
-    rng = np.random.default_rng(seed)
-    twists = np.radians(pose_deg) * np.clip(rng.standard_normal((model.part_count, 3)), -2, 2)
-    twists[0] = 0.0
-    state = replace(
-        model.neutral_state(),
-        beta=0.8 * rng.standard_normal(model.beta_count),
-        rotations=model.absolute_rotations(twists),
-    )
-    vertices = on_both_feet(model, model.vertices(state))
-    lift = vertices[0, 2] - model.vertices(state)[0, 2]
-    return replace(state, translation=state.translation + np.array([0.0, 0.0, lift])), vertices
 
 
 def _values(model: BodyModel, vertices: np.ndarray) -> dict[str, float]:
@@ -91,7 +65,7 @@ def test_landmarks_lie_where_surveys_find_them(model: BodyModel) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_independent_measuring_finds_the_same(model: BodyModel, seed: int) -> None:
-    _, vertices = _body(model, seed)
+    _, vertices = random_body(model, seed)
     truth = TrueBody(model, vertices).values()
     for name, value in _values(model, vertices).items():
         assert value == pytest.approx(truth[name], abs=5e-4), name
@@ -179,262 +153,10 @@ def test_a_fists_girth_is_that_of_its_palm(
 
 
 def test_a_girth_is_as_long_as_its_path(model: BodyModel) -> None:
-    _, vertices = _body(model, 3)
+    _, vertices = random_body(model, 3)
     for row in measure_body(model, vertices).rows:
         if row.closed:
             assert loop_length(row.path, closed=True) == pytest.approx(row.value_m, rel=1e-9)
-
-
-def test_standing_takes_the_scanned_pose_away(model: BodyModel) -> None:
-    """The same person in two stances has one table in the standard pose."""
-    tables = []
-    for pose_deg in (0.0, 4.0):
-        state, vertices = _body(model, 4, pose_deg)
-        state = replace(state, beta=_body(model, 4, 0.0)[0].beta)
-        vertices = model.vertices(state)
-        rows = measure_standing(model, vertices, state).rows
-        tables.append({row.name: row.value_m for row in rows})
-    for name, value in tables[0].items():
-        assert tables[1][name] == pytest.approx(value, abs=0.006), name
-
-
-def test_what_standing_adds_on_the_average_is_taken_off(model: BodyModel) -> None:
-    """Necks and shoulders once came out a centimetre too wide in the standard pose."""
-    state, vertices = _body(model, 4)
-    sigma = np.full(model.vertex_count, 1e-3)
-    traces = trace_all(model, stood_upright(model, vertices, state))
-    rows = measure_standing(model, vertices, state, sigma).rows
-    for trace, row in zip(traces, rows, strict=True):
-        bias = shipped()["standard"][sides_pooled(row.name)].bias
-        assert row.value_m == pytest.approx(max(0.0, trace.value_m - bias)), row.name
-        low, high = row.interval95_m
-        assert low == 0.0 or row.value_m - low == pytest.approx(high - row.value_m), row.name
-
-
-def test_the_standard_pose(model: BodyModel) -> None:
-    body = on_both_feet(model, model.vertices(standard_state(model, np.zeros(model.beta_count))))
-    at = {name: body[index] for name, index in model.landmarks.items()}
-    for side in ("left", "right"):
-        arm = at[f"wrist_{side}"] - at[f"acromion_{side}"]
-        from_trunk = np.degrees(np.arctan2(np.hypot(*arm[:2]), -arm[2]))
-        assert from_trunk == pytest.approx(20.0, abs=2.0)
-        bend = (
-            at[f"elbow_{side}"] - at[f"acromion_{side}"],
-            at[f"wrist_{side}"] - at[f"elbow_{side}"],
-        )
-        cosine = bend[0] @ bend[1] / np.linalg.norm(bend[0]) / np.linalg.norm(bend[1])
-        assert np.degrees(np.arccos(cosine)) < 6.0
-    assert at["heel_left"][0] - at["heel_right"][0] == pytest.approx(0.2, abs=0.03)
-    assert abs(body[:, 2].min()) < 2e-3
-
-
-def test_standing_lines_lie_on_the_scanned_mesh(model: BodyModel) -> None:
-    state, vertices = _body(model, 5)
-    rows = {row.name: row for row in measure_standing(model, vertices, state).rows}
-    path = rows["waist_girth"].path
-    waist = vertices[model.landmarks["waist_front"]]
-    assert np.abs(path[:, 2] - waist[2]).max() < 0.03
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    assert ((path >= low) & (path <= high)).all()
-
-
-def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:
-    """A model learned anew was once shipped with the intervals of the one before."""
-    document = json.loads(files("workers.measure").joinpath(SHIPPED).read_text("utf-8"))
-    assert document["made_of"]["model_sha256"] == model.sha256
-
-
-def test_intervals_hold_what_they_promise() -> None:
-    """Ordinary scans by a constant, strange ones by what they show: 95 of 100 held in either."""
-    rng = np.random.default_rng(0)
-
-    def draw(count: int, strangeness: float) -> RowErrors:
-        sigmas = strangeness * rng.uniform(0.5e-3, 3e-3, count)
-        errors = 2e-3 + np.hypot(1e-3, 4.0 * sigmas) * rng.standard_normal(count)
-        return RowErrors(errors, sigmas, np.zeros(count))
-
-    found = learned(draw(400, 0.05), draw(200, 1.0), draw(400, 0.05))
-    assert found.bias == pytest.approx(2e-3, abs=6e-4)
-    for strangeness in (0.05, 1.0):
-        scans = draw(4000, strangeness)
-        pairs = zip(scans.errors, scans.sigmas, strict=True)
-        ends = np.array([found.interval(1.0 + e, s) for e, s in pairs])
-        held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
-        assert 0.92 < held.mean() < 0.985
-        width = ends[:, 1] - ends[:, 0]
-        assert (width.mean() > 0.01) == (strangeness == 1.0)
-
-
-def test_chance_does_not_pass_for_a_systematic_error() -> None:
-    errors = RowErrors(np.tile([1e-3, -1.1e-3, 2e-3, -1.9e-3], 10), np.zeros(40), np.zeros(40))
-    found = learned(errors, errors, errors)
-    assert found.bias == found.gain == found.noise_gain == 0.0
-
-
-def test_noise_that_stays_widens_the_rows_that_it_was_seen_to_spoil() -> None:
-    rng = np.random.default_rng(0)
-
-    def draw(count: int, noise_m: float) -> RowErrors:
-        noises = np.full(count, noise_m)
-        errors = np.hypot(1e-3, 2.0 * noises) * rng.standard_normal(count)
-        return RowErrors(errors, np.zeros(count), noises)
-
-    found = learned(draw(400, 0.0), draw(200, 0.0), draw(200, 2.6e-3))
-    for noise_m in (0.0, 1.3e-3, 2.6e-3):
-        ends = np.array([found.interval(1.0 + e, 0.0, noise_m) for e in draw(4000, noise_m).errors])
-        held = (ends[:, 0] <= 1.0) & (ends[:, 1] >= 1.0)
-        assert 0.92 < held.mean() < 0.985
-
-
-def test_what_a_scan_says_of_itself_widens_the_rows_it_concerns(model: BodyModel) -> None:
-    sigma, seen = np.full(model.vertex_count, 3e-4), np.ones(model.vertex_count, bool)
-    usual, doubtful = (
-        {
-            row.name: row.interval95_m
-            for row in measure_body(model, model.mean, sigma, seen, errors).rows
-        }
-        for errors in (ScanErrors(), ScanErrors(girth_sigma_m=0.004, crown_sigma_m=0.008))
-    )
-    assert doubtful["height"][1] - doubtful["height"][0] > 0.031
-    assert doubtful["knee_height"] == usual["knee_height"]
-    assert doubtful["waist_girth"][1] > usual["waist_girth"][1] + 0.0005
-
-
-def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) -> None:
-    """A girth of a metre that is 2 pi mm too long: the skin is 1 mm outside."""
-    sigma, seen = np.full(model.vertex_count, 3e-4), np.ones(model.vertex_count, bool)
-    said = ScanErrors(girth_sigma_m=2.0 * np.pi * 1e-3)
-    usual, doubtful = (
-        measure_body(model, model.mean, sigma, seen, errors) for errors in (ScanErrors(), said)
-    )
-    thicker = model.mean + 1e-3 * vertex_normals(model.mean, model.faces)
-    moved = measure_body(model, thicker)
-    for name in ("volume_m3", "surface_m2"):
-        before, after = getattr(usual, name), getattr(doubtful, name)
-        half = [0.5 * (one.interval95[1] - one.interval95[0]) for one in (before, after)]
-        added = np.sqrt(half[1] ** 2 - half[0] ** 2) / 1.96
-        assert added == pytest.approx(getattr(moved, name).value - before.value, rel=0.35), name
-
-
-def test_an_interval_holds_its_value() -> None:
-    low, high = ErrorModel(bias=-8e-3, constant=5e-3, gain=0.0, noise_gain=0.0).interval(0.4, 0.0)
-    assert low == 0.4
-    assert high == pytest.approx(0.413)
-
-
-def test_noisy_readings_get_wider_intervals(model: BodyModel) -> None:
-    """Some rows hardly: in volumes and in the height of the bust, noise averages out."""
-    sigma = np.zeros(model.vertex_count)
-    usual, noisy = (
-        [float(np.diff(row.interval95_m)[0]) for row in body.rows]
-        for body in (
-            measure_body(model, model.mean, sigma, None, ScanErrors(excess_noise_m=noise_m))
-            for noise_m in (0.0, 2.6e-3)
-        )
-    )
-    growth = np.array(noisy) / np.array(usual)
-    assert growth.min() > 1.0 - 1e-9
-    assert np.median(growth) > 1.1
-
-
-def test_noisy_readings_widen_the_volume_of_a_standing_body(model: BodyModel) -> None:
-    sigma, state = np.zeros(model.vertex_count), model.neutral_state()
-    usual, noisy = (
-        float(np.diff(standing.volume_m3.interval95)[0])
-        for standing in (
-            measure_standing(model, model.mean, state, sigma, None, ScanErrors(excess_noise_m=n))
-            for n in (0.0, 2.6e-3)
-        )
-    )
-    assert noisy > 1.02 * usual
-
-
-@pytest.mark.parametrize("sigma", [(np.nan, 0.0), (0.0, np.nan)])
-def test_an_unknown_error_is_not_told_as_none(sigma: tuple[float, float]) -> None:
-    found = ErrorModel(bias=0.0, constant=5e-3, gain=1.0, noise_gain=1.0).interval(0.9, *sigma)
-    assert np.isnan(found).all()
-
-
-def test_a_poorly_seen_body_gets_wider_intervals(model: BodyModel) -> None:
-    sharp = measure_body(model, model.mean, np.full(model.vertex_count, 3e-4))
-    blurred = measure_body(model, model.mean, np.full(model.vertex_count, 4e-3))
-    widths = [
-        np.mean([row.interval95_m[1] - row.interval95_m[0] for row in body.rows])
-        for body in (sharp, blurred)
-    ]
-    assert widths[1] > 1.1 * widths[0]
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_broken_body_is_an_error_that_names_the_row(model: BodyModel) -> None:
-    """Two exchanged cameras gave a crushed one, of which numpy complained in the terminal."""
-    crushed = model.mean.copy()
-    neck, crotch = (model.landmarks[name] for name in TRUNK_ENDS)
-    # Skin counts within a share of the distance between them.
-    crushed[neck] = crushed[crotch] + 1e-9
-    with pytest.raises(InputError, match="its landmarks give no direction; fit the body again"):
-        trace_all(model, crushed)
-    flat = model.mean * (1.0, 1.0, 0.0)
-    with pytest.raises(InputError, match="cannot be measured"):
-        trace_all(model, flat)
-    torn = model.mean.copy()
-    torn[100] = np.nan
-    with pytest.raises(InputError, match="not numbers"):
-        trace_all(model, torn)
-
-
-def test_a_landmark_far_astray_blanks_its_own_rows_alone(model: BodyModel) -> None:
-    """One knee in a torn cloud ended the whole result."""
-    spiked = model.mean.copy()
-    spiked[model.landmarks["knee_left"], 2] = 3.0
-    document = measurements_document(Origin("s1"), measure_body(model, spiked))
-    blank = {row["name"] for row in document["measurements"] if row["value_m"] is None}
-    assert blank == {"knee_girth_left"}
-    assert "knee_girth" not in {row["name"] for row in document["differences"]}
-
-
-@pytest.mark.parametrize("bow_deg", range(0, 60, 5))
-def test_a_chin_on_the_chest_blanks_the_neck_alone(model: BodyModel, bow_deg: int) -> None:
-    """Around shoulders and chin together, a neck of 53 cm was measured as 91."""
-    twists = np.zeros((model.part_count, 3))
-    for part in ("neck", "head"):
-        twists[model.part_names.index(part), 0] = np.radians(bow_deg)
-    bowed = replace(model.neutral_state(), rotations=model.absolute_rotations(twists))
-    document = measurements_document(Origin("s1"), measure_body(model, model.vertices(bowed)))
-    blank = {row["name"]: row for row in document["measurements"] if row["value_m"] is None}
-    assert set(blank) == ({"neck_girth"} if bow_deg > 25 else set())
-    assert all(row["path"] == [] and row["interval95_m"] is None for row in blank.values())
-    neck = next(row for row in document["measurements"] if row["name"] == "neck_girth")
-    assert bow_deg > 25 or neck["value_m"] == pytest.approx(0.35, abs=0.015)
-
-
-def test_a_row_says_whether_cameras_saw_its_line(model: BodyModel) -> None:
-    """The front alone: what runs along the front is seen, the back's is the model's."""
-    seen = model.mean[:, 1] < model.mean[model.landmarks["waist_side_left"], 1]
-    skin = SeenSkin.build(model, model.mean, seen)
-    traces = trace_all(model, model.mean)
-    names = [trace.definition.name for trace in traces]
-    basis = dict(zip(names, skin.bases(traces), strict=True))
-    assert basis["across_front_skin_width"] == basis["crotch_length_front"] == "seen"
-    assert basis["waist_girth"] == basis["belly_girth"] == "partly"
-    assert basis["crotch_length_back"] == basis["across_back_skin_width"] == "inferred"
-    assert {row.basis for row in measure_body(model, model.mean).rows} == {"seen"}
-
-
-def test_a_height_is_seen_where_the_head_was_seen_to_end(model: BodyModel) -> None:
-    """No camera has readings of a crown."""
-    sigma = np.full(model.vertex_count, 1e-3)
-    nothing = np.zeros(model.vertex_count, bool)
-    basis = {
-        crown: {
-            row.name: row.basis
-            for row in measure_body(
-                model, model.mean, sigma, nothing, ScanErrors(crown_sigma_m=crown)
-            ).rows
-        }["height"]
-        for crown in (0.0, 0.008)
-    }
-    assert basis == {0.0: "seen", 0.008: "inferred"}
 
 
 def test_differences_are_left_minus_right(model: BodyModel) -> None:

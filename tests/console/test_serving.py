@@ -1,0 +1,100 @@
+"""Console's process: its port, its end, and whom it may serve."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from ctrl_c import heard
+from live_console import API, free_port
+from running_station import STATION
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+from station.console.api.console import Console
+from station.console.security.certificate import make_certificate
+from station.console.server import _awaited_listener, check_exposure
+from station.core.config import ConsoleConfig
+from station.core.config_file import load_config
+from station.core.errors import ConfigError
+from station.core.service import read_health
+
+
+def test_a_console_whose_port_is_taken_says_so_and_waits(tmp_path: Path) -> None:
+    """It ended again and again, and status did not say why."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        path = tmp_path / "booth.toml"
+        path.write_text(
+            '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+            f"[console]\nport = {port}\n"
+        )
+        console = Console(load_config(path), path, logging.getLogger())
+        stop = threading.Event()
+        got: list[socket.socket | None] = []
+        waiting = threading.Thread(
+            target=lambda: got.append(_awaited_listener(console, console.log, stop))
+        )
+        waiting.start()
+        while not (told := read_health(console.config.runtime.folder, "console")):
+            time.sleep(0.05)
+        assert told["problems"][0].startswith(f"the console cannot listen at 127.0.0.1:{port} (")
+    waiting.join(60.0)
+    [listener] = got
+    assert listener is not None
+    listener.close()
+    stop.set()
+    assert _awaited_listener(console, console.log, stop) is None
+    console.vault.close()
+    console.audit.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_console_that_is_watched_ends_quietly(tmp_path: Path, number: signal.Signals) -> None:
+    """A page that was open was cut off, with a traceback."""
+    path, port = tmp_path / "booth.toml", free_port()
+    path.write_text(
+        f'[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n[console]\nport = {port}\n'
+    )
+    command = [*STATION, "console", "--config", str(path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as console:
+        assert console.stderr is not None
+        while "the console is at" not in console.stderr.readline():
+            assert console.poll() is None
+        place = f"127.0.0.1:{port}{API}"
+        with (
+            connect(
+                f"ws://{place}/pictures", origin=Origin(f"http://127.0.0.1:{port}")
+            ) as pictures,
+            httpx.stream("GET", f"http://{place}/events", timeout=60.0) as events,
+        ):
+            pictures.send("next")
+            parts = events.iter_raw()
+            assert next(parts).startswith(b"retry")
+            console.send_signal(number)
+            rest = console.stderr.read()
+            assert console.wait(60.0) == 0
+    assert rest == ""
+
+
+def test_beyond_this_machine_password_and_certificate_are_needed(tmp_path: Path) -> None:
+    assert not check_exposure(ConsoleConfig(folder=tmp_path), has_password=False)
+    open_to_all = ConsoleConfig(folder=tmp_path, host="0.0.0.0")
+    with pytest.raises(ConfigError, match="--set-password"):
+        check_exposure(open_to_all, has_password=False)
+    with pytest.raises(ConfigError, match="--make-certificate"):
+        check_exposure(open_to_all, has_password=True)
+    path = make_certificate(tmp_path, ["booth.shop.example", "192.168.1.9"])
+    assert check_exposure(open_to_all, has_password=True)
+    assert ((tmp_path / "key.pem").stat().st_mode & 0o077) == 0
+    ssl.create_default_context(cafile=str(path))

@@ -1,0 +1,140 @@
+"""Secrets of the console: password, sessions and tokens on the disk."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import httpx
+import pytest
+from click.testing import CliRunner
+from live_console import API, PASSWORD
+
+from station.console.api.console import Console
+from station.console.app import create_app
+from station.console.security.vault import Vault
+from station.core.config_file import load_config
+from station.core.errors import BoothError
+
+_SESSIONS_OF_A_PAGE = 60
+"""So many rows do not fit on one page of sqlite's, 4 kB."""
+
+
+@pytest.fixture
+def vault(tmp_path: Path) -> Vault:
+    return Vault(tmp_path / "console")
+
+
+def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
+    """It was a 500 without words, from sqlite."""
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    console = Console(load_config(path), path, logging.getLogger())
+    console.vault.set_password(PASSWORD)
+    database = console.vault._database
+    [[pages]] = database.execute("PRAGMA page_count")
+    database.execute(f"PRAGMA max_page_count = {pages}")
+    # Not by logging in: each password that is checked takes 0.2 s of a core.
+    with pytest.raises(OSError, match="No space left on device"):
+        list(map(console.vault.open_session, [1.0] * _SESSIONS_OF_A_PAGE))
+
+    async def answer() -> httpx.Response:
+        transport = httpx.ASGITransport(create_app(console))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            return await client.post(f"{API}/session", json={"password": PASSWORD})
+
+    told = asyncio.run(answer())
+    assert (told.status_code, told.json()["type"]) == (503, "/problems/disk"), told.text
+    assert "No space left on device" in told.json()["detail"]
+    assert "console.sqlite" in told.json()["detail"]
+    console.vault.close()
+    console.audit.close()
+
+
+def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:
+    """The console ended with a traceback from sqlite whenever it was started."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(OSError, match=r"console\.sqlite"):
+            Vault(tmp_path / "console")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:
+    secret = vault.make_token("orders", ("read",), None)
+    session = vault.open_session(1.0)
+    vault.set_password("a good password")
+    stored = b"".join(p.read_bytes() for p in (tmp_path / "console").iterdir())
+    for text in (secret, session, "a good password"):
+        assert text.encode() not in stored
+    assert b"$argon2id$" in stored
+    assert all((p.stat().st_mode & 0o077) == 0 for p in (tmp_path / "console").iterdir())
+    # A new password ends every session.
+    assert not vault.session_holds(session)
+    assert vault.check_password("a good password")
+    assert not vault.check_password("another password")
+    with pytest.raises(BoothError, match="8 characters"):
+        vault.set_password("short")
+
+
+def test_a_password_of_any_script(vault: Vault) -> None:
+    """One keyboard sends an accented letter, the other a letter and an accent."""
+    vault.set_password("Caf\u00e9 \u6d4b\u91cf \U0001f4cf")
+    assert vault.check_password("Cafe\u0301 \u6d4b\u91cf \U0001f4cf")
+    assert not vault.check_password("Cafe \u6d4b\u91cf \U0001f4cf")
+    assert not vault.check_password("\udcff" * 12)
+    with pytest.raises(BoothError, match="not UTF-8"):
+        vault.set_password("\udcff" * 12)
+
+
+def test_tokens_expire_and_are_revoked(vault: Vault) -> None:
+    gone = vault.make_token("gone", ("read",), 0.0)
+    kept = vault.make_token("kept", ("scan", "read"), 1.0)
+    assert vault.find_token(gone) is None
+    found = vault.find_token(kept)
+    assert found is not None
+    assert found.scopes == ("read", "scan")
+    with pytest.raises(BoothError, match="already"):
+        vault.make_token("kept", ("read",), None)
+    vault.revoke_token("kept")
+    assert vault.find_token(kept) is None
+    with pytest.raises(BoothError, match="no token"):
+        vault.revoke_token("kept")
+
+
+def test_tokens_on_the_command_line(tmp_path: Path) -> None:
+    from station.cli import station
+
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    option = ["--config", str(config)]
+    made = CliRunner().invoke(station, ["token", "make", "orders", "--scope", "scan", *option])
+    secret = made.output.splitlines()[0]
+    assert Vault(tmp_path / "console").find_token(secret) is not None
+    assert "orders" in CliRunner().invoke(station, ["token", "list", *option]).output
+    assert CliRunner().invoke(station, ["token", "revoke", "orders", *option]).exit_code == 0
+    assert Vault(tmp_path / "console").find_token(secret) is None
+
+
+@pytest.mark.usefixtures("in_shanghai")
+def test_a_token_is_listed_with_the_local_day_of_its_end(tmp_path: Path) -> None:
+    """At 20:00 UTC the next day has begun in Shanghai."""
+    from station.cli import station
+
+    config = tmp_path / "booth.toml"
+    config.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    end_s = datetime(2030, 1, 1, 20, tzinfo=UTC).timestamp()
+    vault = Vault(tmp_path / "console")
+    vault.make_token("orders", ("scan",), (end_s - time.time()) / 86400.0)
+    vault.make_token("sheets", ("read",), None)
+    listed = CliRunner().invoke(station, ["token", "list", "--config", str(config)]).output
+    assert [line.split("  ")[-1].strip() for line in listed.splitlines()] == [
+        "until 2030-01-02",
+        "does not expire",
+    ]
