@@ -209,6 +209,37 @@ def test_another_language_says_the_same(console: LiveConsole) -> None:
         expect(page.locator("#label")).to_be_visible(timeout=LONG_MS)
 
 
+def test_a_language_that_does_not_come_is_told(console: LiveConsole) -> None:
+    """The list said 中文, and nothing else happened."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        open_view(page, console, "history")
+        expect(page.locator("h1")).to_have_text("History", timeout=LONG_MS)
+        page.route("**/phrases.json", lambda route: route.abort())
+        page.select_option("#language", "zh")
+        expect(page.locator(".notice.bad")).to_contain_text("cannot be reached", timeout=LONG_MS)
+        assert page.locator("#language").input_value() == "en"
+        assert page.evaluate("localStorage.getItem('booth.language')") == "en"
+        expect(page.locator("h1")).to_have_text("History")
+        page.unroute("**/phrases.json")
+        page.select_option("#language", "zh")
+        expect(page.locator("h1")).to_have_text("记录", timeout=LONG_MS)
+
+
+def test_a_log_out_that_does_not_arrive_is_told(console: LiveConsole) -> None:
+    """The page was loaded anew, and whoever had logged out was logged in."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        page.route("**/session", lambda route: route.abort())
+        page.click("#logout")
+        expect(page.locator(".notice.bad")).to_contain_text("cannot be reached", timeout=LONG_MS)
+        page.unroute("**/session")
+        page.click("#logout")
+        expect(page.locator("#password")).to_be_visible(timeout=LONG_MS)
+
+
 def test_nobody_is_said_to_be_absent_whom_no_camera_sees(console: LiveConsole) -> None:
     with browser() as started, console.client() as client:
         page = tablet(started).new_page()

@@ -6,6 +6,8 @@ import asyncio
 import logging
 import resource
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 from live_console import API, PASSWORD
 
-from station.console.api.console import Console
+from station.console.api.console import COOKIE, Console
 from station.console.app import create_app
 from station.console.security.vault import Vault
 from station.core.config_file import load_config
@@ -55,15 +57,49 @@ def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
     console.audit.close()
 
 
-def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:
-    """The console ended with a traceback from sqlite whenever it was started."""
+@contextmanager
+def _nothing_written() -> Iterator[None]:
+    """No file grows, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
     try:
-        with pytest.raises(OSError, match=r"console\.sqlite"):
-            Vault(tmp_path / "console")
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:
+    """The console ended with a traceback from sqlite whenever it was started."""
+    with _nothing_written(), pytest.raises(OSError, match=r"console\.sqlite"):
+        Vault(tmp_path / "console")
+
+
+def test_who_logs_out_is_logged_out_on_a_full_disk(tmp_path: Path) -> None:
+    """The cookie was kept, and so was the session."""
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    console = Console(load_config(path), path, logging.getLogger())
+    console.vault.set_password(PASSWORD)
+    secret = console.vault.open_session(1.0)
+
+    async def answers() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(create_app(console))
+        cookie = {"Cookie": f"{COOKIE}={secret}"}
+        async with httpx.AsyncClient(
+            transport=transport, base_url="http://127.0.0.1", headers=cookie
+        ) as client:
+            place = f"{API}/session"
+            return [await client.get(place), await client.delete(place), await client.get(place)]
+
+    with _nothing_written():
+        before, told, after = asyncio.run(answers())
+    assert [answer.json()["logged_in"] for answer in (before, told, after)] == [True, False, False]
+    assert f'{COOKIE}=""' in told.headers["set-cookie"]
+    assert "Max-Age=0" in told.headers["set-cookie"]
+    console.vault.open_session(1.0)
+    assert not Vault(console.config.console.folder).session_holds(secret)
+    console.vault.close()
+    console.audit.close()
 
 
 def test_secrets_are_stored_hashed(vault: Vault, tmp_path: Path) -> None:

@@ -70,6 +70,8 @@ class Vault:
         self._folder = private_folder(folder)
         self._hasher = PasswordHasher()
         self._lock = threading.Lock()
+        self._ended: set[str] = set()
+        """Hashes of sessions that ended while the disk refused to delete them."""
         self._path = private_file(folder / _DATABASE)
         with _disk_told(self._path):
             self._database = sqlite3.connect(
@@ -119,15 +121,24 @@ class Vault:
         secret = secrets.token_urlsafe(32)
         now = time.time()
         self._run("DELETE FROM sessions WHERE expires < ?", now)
+        for digest in tuple(self._ended):
+            self._run("DELETE FROM sessions WHERE hash = ?", digest)
+            self._ended.discard(digest)
         self._run("INSERT INTO sessions VALUES (?, ?)", _hash(secret), now + 3600 * hours)
         return secret
 
     def session_holds(self, secret: str) -> bool:
         query = "SELECT 1 FROM sessions WHERE hash = ? AND expires > ?"
-        return bool(self._run(query, _hash(secret), time.time()))
+        digest = _hash(secret)
+        return digest not in self._ended and bool(self._run(query, digest, time.time()))
 
     def close_session(self, secret: str) -> None:
-        self._run("DELETE FROM sessions WHERE hash = ?", _hash(secret))
+        """End a session. Where the disk refuses, this process alone knows until the next login."""
+        digest = _hash(secret)
+        try:
+            self._run("DELETE FROM sessions WHERE hash = ?", digest)
+        except OSError:
+            self._ended.add(digest)
 
     def make_token(self, name: str, scopes: Iterable[Scope], days: float | None) -> str:
         """A new token; shown once, only its hash is kept.

@@ -40,8 +40,16 @@ function drawRail() {
 
 // Without loading the page anew: what it tells of a scan, and its notices, stay.
 async function speak(language) {
+  const before = currentLanguage();
   setLanguage(language);
-  await load(session.language);
+  try { await reached(load(session.language)); } catch (error) {
+    const chosen = document.getElementById('language');
+    if (chosen.value !== language) return; // another one meanwhile
+    setLanguage(before);
+    chosen.value = before;
+    notice(error.message, true);
+    return;
+  }
   drawRail();
   document.getElementById('language').focus();
   show({ again: true });
@@ -53,7 +61,7 @@ async function load(fallback) {
 }
 
 async function logOut() {
-  await remove('/session').catch(() => {});
+  try { await remove('/session'); } catch (error) { notice(error.message, true); return; }
   location.reload();
 }
 

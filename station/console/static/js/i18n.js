@@ -3,16 +3,22 @@
 let words = {};
 let phrases = [];
 let language = 'en';
+let asked = 0;
 // Asked for at once, while the page's other parts are still on their way.
 const coming = fetch('/static/catalogue.json').then((answer) => answer.json());
 
 export async function loadWords(fallback) {
   const catalogue = await coming;
   const kept = stored('language');
-  language = catalogue[kept] ? kept : (fallback || 'en');
+  const wanted = catalogue[kept] ? kept : (fallback || 'en');
+  // All of a language, or none of it where the console cannot be reached.
+  const mine = ++asked;
+  const found = wanted === 'zh' ? compiled(await (await fetch('/static/phrases.json')).json()) : [];
+  if (mine !== asked) return;
+  phrases = found;
+  language = wanted;
   words = catalogue[language];
   document.documentElement.lang = language === 'zh' ? 'zh-CN' : 'en';
-  phrases = language === 'zh' ? compiled(await (await fetch('/static/phrases.json')).json()) : [];
 }
 
 // What the station says (a reason, a remedy, an error) in the reader's language. The same rules as
