@@ -147,7 +147,7 @@ class ControlProcess:
                 # It hangs, or there is very much; the next one goes on where this one ends.
                 self._purge.kill()
                 return
-            command = [sys.executable, "-m", "station.cli", "purge", "--old"]
+            command = [sys.executable, "-m", "station.cli", "purge", "--old", "--logged"]
             self._purge = subprocess.Popen(
                 [*command, "--config", str(self._config_path)],
                 stdin=subprocess.DEVNULL,

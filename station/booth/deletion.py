@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import delete
 from station.core.scans import STATES, Notes, ScanId, plain_label, scan_id_of
+from station.core.service import set_up_logs
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
 
@@ -145,7 +146,10 @@ def _removable(
 @config_option
 @click.option("--label", help="delete all scans with exactly this label")
 @click.option("--old", is_flag=True, help="remove everything past its retention period")
-def purge(scan_id: str | None, config_path: Path | None, label: str | None, old: bool) -> None:
+@click.option("--logged", is_flag=True, hidden=True, help="tell it in the booth's log")
+def purge(
+    scan_id: str | None, config_path: Path | None, label: str | None, old: bool, logged: bool
+) -> None:
     """Delete a scan and its results, all scans with a label, or all that are past their retention
     period.
 
@@ -157,6 +161,7 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
     """
     if sum([bool(scan_id), label is not None, old]) != 1:
         raise click.UsageError("give a scan id, --label or --old")
+    say: Callable[[str], None] = set_up_logs("purge").info if logged else click.echo
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)
     deleted = Deleted()
@@ -173,10 +178,10 @@ def purge(scan_id: str | None, config_path: Path | None, label: str | None, old:
             purge_scans(spool, scans, deleted)
     finally:
         for path in deleted.paths:
-            click.echo(f"removed {path}")
+            say(f"removed {path}")
         if words := deleted.copies_words():
-            click.echo(words)
-    if old and not deleted.paths:
+            say(words)
+    if old and not deleted.paths and not logged:
         click.echo("nothing is past its retention period")
     forget_labels(ScanIndex(spool))
 

@@ -7,6 +7,7 @@ names (sd_notify). A process that reports none within its time limit is killed a
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import socket
 import subprocess
@@ -24,7 +25,13 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import held, private_folder
-from station.core.service import STATION_LOCK, die_with_parent, file_name, stop_event
+from station.core.service import (
+    STATION_LOCK,
+    die_with_parent,
+    file_name,
+    set_up_logs,
+    stop_event,
+)
 from station.messaging.transport import socket_folder
 
 WATCHDOG_S = 10.0
@@ -36,6 +43,7 @@ _BACK_OFF_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 whose configuration had been deleted kept both cores busy."""
 _CALM_S = 10.0
 _STOP_S = 5.0
+_LOG = logging.getLogger("run")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +135,7 @@ class _Child:
         now_s = time.monotonic()
         if self.process is not None and self.process.poll() is None:
             if self.watch.silent_for_s() > 0.0:
-                click.echo(f"{self.service.name} hangs; killing it", err=True)
+                _LOG.warning("%s hangs; killing it", self.service.name)
                 self.process.kill()
                 self.process.wait()
             return
@@ -147,7 +155,7 @@ class _Child:
         self._failures = 0 if now_s - self._started_s > _CALM_S else self._failures + 1
         pause_s = _BACK_OFF_S[min(self._failures, len(_BACK_OFF_S) - 1)]
         self._next_s = now_s + pause_s
-        click.echo(f"{self.service.name} {why}; restarting it in {pause_s:g} s", err=True)
+        _LOG.warning("%s %s; restarting it in %g s", self.service.name, why, pause_s)
 
     def _start(self) -> None:
         self.process = subprocess.Popen(
@@ -212,6 +220,7 @@ def run(config_path: Path | None) -> None:
             from station.calibration.guide.store import CalibrationStore
 
             click.echo(CalibrationStore.of(config).missing_words())
+        set_up_logs(_LOG.name)
         table = services(config)
         longest = max((_socket_name(service.name) for service in table), key=len)
         supervise(table, path.resolve(), socket_folder(folder, longest), stop_event())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import logging
 import math
 import os
 import signal
@@ -19,7 +20,7 @@ from typing import Any
 import click
 
 from station.core.errors import BoothError, InputError
-from station.core.service import set_up_caches
+from station.core.service import has_log, set_up_caches
 from station.core.start.interrupts import loading
 
 config_option = click.option(
@@ -148,6 +149,14 @@ def _terminate(*_: object) -> None:
     raise _Ended(signal.SIGTERM)
 
 
+def _tell(error: str) -> None:
+    """Tell of an error: a process that has a log in its log, a command on its terminal."""
+    if has_log():
+        logging.getLogger().error(error)
+    else:
+        click.echo(f"error: {error}", err=True)
+
+
 def run(group: click.Group) -> None:
     """Call a command; an error that the user can act upon becomes one line and exit code 1.
 
@@ -163,28 +172,26 @@ def run(group: click.Group) -> None:
         signal.signal(ended.code, signal.SIG_DFL)
         os.kill(os.getpid(), ended.code)
     except BoothError as error:
-        click.echo(f"error: {error}", err=True)
+        _tell(str(error))
         sys.exit(1)
     except OSError as error:
         if error.filename and error.errno in (*_NO_ACCESS, *_NO_PLACE):
-            click.echo(
-                f"error: {error.filename} cannot be used ({error.strerror}); check its name, and "
-                "that this user may read and write there",
-                err=True,
+            _tell(
+                f"{error.filename} cannot be used ({error.strerror}); check its name, and "
+                "that this user may read and write there"
             )
             sys.exit(1)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
             raise
         where = f": {error.filename}" if error.filename else ""
-        click.echo(
-            f"error: the disk cannot be written ({error.strerror}{where}); free some space, then "
-            "run the command again",
-            err=True,
+        _tell(
+            f"the disk cannot be written ({error.strerror}{where}); free some space, then "
+            "run the command again"
         )
         sys.exit(1)
     except ModuleNotFoundError as error:
         remedy = _OPTIONAL.get(error.name or "")
         if remedy is None:
             raise
-        click.echo(f"error: {remedy}", err=True)
+        _tell(remedy)
         sys.exit(1)

@@ -52,6 +52,7 @@ _BEAT_PERIOD_S = 0.5
 _HEALTH_PERIOD_S = 0.25
 _MAX_HEALTH_BYTES = 1 << 20
 
+_HANDLER = "booth"
 _JOURNAL = "/run/systemd/journal/socket"
 _PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 """Python's levels as syslog's; what is below them is 7, for debugging."""
@@ -78,8 +79,14 @@ def set_up_logs(process: str) -> logging.Logger:
         handler = logging.StreamHandler()
         words = f"%(asctime)s {process}: %(levelname)s %(message)s"
         handler.setFormatter(logging.Formatter(words, datefmt="%H:%M:%S"))
+    handler.name = _HANDLER
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     return logging.getLogger(process)
+
+
+def has_log() -> bool:
+    """Whether this process has a log of its own, made by `set_up_logs`."""
+    return any(handler.name == _HANDLER for handler in logging.getLogger().handlers)
 
 
 @contextlib.contextmanager
@@ -91,9 +98,10 @@ def only_process(runtime_folder: Path, process: str) -> Iterator[logging.Logger]
     """
     lock = runtime_folder / f"{file_name(process)}{_LOCK}"
     busy = BoothError(f"a {process} process is already running here ({lock}); end it first")
+    log = set_up_logs(process)
     with held(lock, busy):
         return_freed_memory()
-        yield set_up_logs(process)
+        yield log
 
 
 def return_freed_memory() -> None:
