@@ -109,7 +109,7 @@ def _purge(spool: Spool, scan_id: ScanId, paths: list[Path], deleted: Deleted) -
             deleted.paths.append(path)
     # One may have received it meanwhile. Nothing else knows of the copies from now on.
     deleted.receivers.update(ledger.receivers(scan_id))
-    ledger.forget(scan_id)
+    ledger.forget(scan_id, replaced=True)
 
 
 @contextmanager

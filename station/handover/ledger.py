@@ -101,16 +101,28 @@ class Ledger:
                 path.unlink(missing_ok=True)
 
     def receivers(self, scan_id: str) -> list[str]:
-        """Targets that have a copy of a scan's result; also those that booth.toml named before."""
-        places = self._folder.glob("*/done")
-        return sorted(place.parent.name for place in places if (place / scan_id).exists())
+        """Targets that have a copy of a scan's result; also those that booth.toml named before,
+        and those that the record names which a restored backup replaced."""
+        places = [
+            place for folder in (self._folder, *self._replaced()) for place in folder.glob("*/done")
+        ]
+        return sorted({place.parent.name for place in places if (place / scan_id).exists()})
 
-    def forget(self, scan_id: str) -> None:
-        """Remove all that is kept of a scan that was deleted."""
+    def forget(self, scan_id: str, *, replaced: bool = False) -> None:
+        """Remove all that is kept of a scan that was deleted.
+
+        Args:
+            replaced: also from what a restored backup replaced, where its bundle may still lie.
+        """
+        folders = (self._folder, *(self._replaced() if replaced else ()))
         for place, name in (("done", scan_id), ("waiting", f"{scan_id}.json")):
             # The name itself is no pattern: any folder may lie in the outbox.
-            for folder in self._folder.glob(f"*/{place}"):
+            for folder in [found for kept in folders for found in kept.glob(f"*/{place}")]:
                 (folder / name).unlink(missing_ok=True)
+
+    def _replaced(self) -> list[Path]:
+        """Earlier records, which `station restore` keeps beside this one."""
+        return list(self._folder.parent.glob(f".{self._folder.name}.before-restore*"))
 
     def waiting(self) -> list[Waiting]:
         """All waiting results of all targets."""

@@ -137,6 +137,28 @@ def test_receivers_are_known_as_long_as_anything_of_a_scan_is(spool: Spool) -> N
     assert deleted.receivers == {"share"}
 
 
+def test_receivers_are_known_from_what_a_restored_backup_replaced(spool: Spool) -> None:
+    """Nobody was named who had received a result since the backup."""
+    ledger, retention = Ledger(spool.folder), RetentionConfig(raw_days=7, result_days=1)
+    ledger.finish(Waiting("share", _ONE))
+    ledger.finish(Waiting("share", _TWO))
+    for name in ("handover", "scans", "done"):
+        (spool.folder / name).rename(spool.folder / f".{name}.before-restore-2")
+    spool = Spool(spool.folder)
+    ledger.finish(Waiting("orders", _ONE))
+    expire_old(spool, retention, Moment(1.8e9, 100.0, "boot"))
+    deleted = Deleted()
+    expire_old(spool, retention, Moment(1.8e9, 100.0 + 2 * _DAY_S, "boot"), deleted=deleted)
+    assert deleted.receivers == {"orders", "share"}
+    # Of its bundle, which no retention period reaches there, it is still known.
+    assert ledger.receivers(_ONE) == ["share"]
+    for one in (_ONE, _TWO):
+        deleted = Deleted()
+        purge_scans(spool, [one], deleted)
+        assert deleted.receivers == {"share"}
+        assert not [path for path in spool.folder.rglob("*") if path.name.startswith(one)]
+
+
 def test_thousands_of_scans_are_deleted_in_one_look(tmp_path: Path) -> None:
     """Each one looked through all folders: a thousand took twenty seconds."""
     spool = Spool(tmp_path)
