@@ -37,7 +37,7 @@ class SurfaceDifference:
 def compare_rows(
     first: Path, second: Path, pose: Pose, unit: Unit, language: Language
 ) -> list[dict[str, Any]]:
-    """Each measurement that both results have, second minus first.
+    """Each measurement that both results have, second minus first, as both are rounded.
 
     A difference counts as real where it exceeds what both 95 % intervals explain together
     (the root of the sum of their half-widths' squares).
@@ -62,14 +62,15 @@ def compare_rows(
         difference_m = other["value_m"] - row["value_m"]
         half_m = [(r["interval95_m"][1] - r["interval95_m"][0]) / 2 for r in (row, other)]
         uncertain_m = float(np.hypot(*half_m))
+        before, after = (round(scale * r["value_m"], digits) for r in (row, other))
         compared.append(
             {
                 "name": name,
                 "words": plain_name(name, language, with_side=False),
                 "side": split_side(name)[1],
-                "first": round(scale * row["value_m"], digits),
-                "second": round(scale * other["value_m"], digits),
-                "difference": round(scale * difference_m, digits),
+                "first": before,
+                "second": after,
+                "difference": round(after - before, digits),
                 "uncertainty": round(scale * uncertain_m, digits),
                 "real": bool(abs(difference_m) > uncertain_m),
             }

@@ -130,15 +130,20 @@ def side_differences(
 ) -> list[dict[str, Any]]:
     """Left less right of each measurement with two sides, with its 95 % interval in a unit.
 
-    `real` says that the interval does not hold 0. Results of earlier versions have none.
+    The difference is that of both rounded values, which stand beside it. `real` says that the
+    interval does not hold 0. Results of earlier versions have none.
     """
     found = []
+    shown = {row["name"]: row["value"] for row in rows(document, unit, language)}
     for entry in document.get("differences", ()):
         low, high = entry["interval95_m"]
         value, *ends = (
             round(PER_METRE[unit] * length, DIGITS[unit])
             for length in (entry["value_m"], low, high)
         )
+        left, right = (shown.get(f"{entry['name']}_{side}") for side in ("left", "right"))
+        if left is not None and right is not None:
+            value = round(left - right, DIGITS[unit])
         found.append(
             {
                 "name": str(entry["name"]),

@@ -233,30 +233,17 @@ def test_a_label_is_text_and_nothing_else(page: Page, console: LiveConsole) -> N
     expect(page.locator("h1")).to_have_text("<script>alert(1)</script>")
 
 
-def _hip_height(route: Route) -> None:
-    """The comparison, as if the hips were 87.34 and 87.36 cm high."""
-    found = route.fetch().json()
-    for row in found["rows"]:
-        if row["words"] == "Hip height":
-            row.update(first=87.3, second=87.4, difference=0.0)
-    route.fulfill(json=found)
-
-
 def test_history_compares_and_deletes(page: Page, console: LiveConsole) -> None:
     gone = console.scan("to be deleted")
     open_view(page, console, "history")
     expect(page.locator("tr[data-scan]").nth(2)).to_be_visible()
     _picture(page, "history")
     _accessible(page)
-    page.route("**/comparison/*?*", _hip_height)
     done = page.locator(".check:enabled")
     done.nth(0).check()
     done.nth(1).check()
     page.click("#compare")
     expect(page.locator("#compared tbody tr").nth(40)).to_be_attached(timeout=LONG_MS)
-    # It said "87.3 | 87.4 | 0.0".
-    hips = page.locator("#compared tr", has_text="Hip height").locator("td")
-    expect(hips.nth(3)).to_have_text(re.compile(r"^\+0\.1 "))
     expect(page.locator("canvas[data-ready=yes]")).to_be_visible(timeout=LONG_MS)
     _picture(page, "compare")
     _accessible(page)

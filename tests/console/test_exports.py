@@ -19,15 +19,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pypdf
 import pytest
+from click.testing import CliRunner
 from live_console import LiveConsole
 
+from station.archive.compare import compare_rows
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import seamly_name, smis
 from station.archive.surfaces import Surface, aligned, distances
-from station.archive.tables import csv_table, read_measurements, rows
+from station.archive.tables import csv_table, read_measurements, rows, side_differences
 from station.core.config_file import load_config
+from station.core.files import write_json
 from station.core.geometry import so3_exp
 from station.core.service import set_up_logs
 from station.core.spool import Spool
@@ -35,6 +38,7 @@ from station.core.words.terms import TERMS, Language, plain_name, split_side
 from station.handover.deliver_cli import HandOver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from workers.measure.definitions import DEFINITIONS
+from workers.reconstruct.measure_cli import measure
 
 _DOCUMENT: dict[str, Any] = {
     "format": "booth-measurements", "version": 1, "pose": "as-scanned",
@@ -82,6 +86,33 @@ def test_a_spreadsheet_is_in_one_language() -> None:
 
     assert bases("en") == ["seen", "", "partly"]
     assert bases("zh") == ["可见", "", "部分可见"]
+
+
+def test_a_difference_is_that_of_the_numbers_beside_it(tmp_path: Path) -> None:
+    """The page and the sheet said 17.3 and 17.2, and a difference of 0.2; two scans 87.3 and 87.4,
+    and 0.0."""
+    table = {**_DOCUMENT, "differences": [
+        {"name": "wrist_girth", "value_m": 0.0016, "interval95_m": [0.0006, 0.0026]},
+    ]}  # fmt: skip
+    for number, waist_m in enumerate((0.8734, 0.8736)):
+        table["measurements"] = [
+            {**row, "value_m": value_m, "interval95_m": [value_m - 0.001, value_m + 0.001]}
+            for row, value_m in zip(
+                _DOCUMENT["measurements"], (waist_m, 0.1734, 0.1718), strict=True
+            )
+        ]
+        (tmp_path / f"{number}").mkdir()
+        write_json(tmp_path / f"{number}/measurements.json", table)
+    _, left, right = rows(table, "cm", "en")
+    [sides] = side_differences(table, "cm", "en")
+    assert (left["value"], right["value"], sides["value"]) == (17.3, 17.2, 0.1)
+    assert sides["real"]
+    told = CliRunner().invoke(measure, [str(tmp_path / "0")]).output
+    assert re.search(r"Wrist girth, left +17\.3 cm", told)
+    assert re.search(r"Wrist girth, right +17\.2 cm", told)
+    assert re.search(r"Wrist girth +0\.1 cm .* larger on the left", told)
+    waist = compare_rows(tmp_path / "0", tmp_path / "1", "as-scanned", "cm", "en")[0]
+    assert (waist["first"], waist["second"], waist["difference"]) == (87.3, 87.4, 0.1)
 
 
 def test_seamly_reads_what_was_written() -> None:

@@ -176,7 +176,8 @@ def _write_csv(document: dict[str, Any]) -> None:
             [row["name"], *numbers, "m", row.get("basis") or "", row.get("standard") or ""]
         )
     for row in document.get("differences") or ():
-        numbers = tuple(round(x, _DIGITS) for x in (row["value_m"], *row["interval95_m"]))
+        ends = (round(x, _DIGITS) for x in row["interval95_m"])
+        numbers = (_left_less_right(document, row, 1.0, _DIGITS), *ends)
         writer.writerow([f"{row['name']}_left_minus_right", *numbers, "m", "", ""])
     for name, unit, content in _contents(document):
         numbers = tuple(round(x, _DIGITS) for x in (content["value"], *content["interval95"]))
@@ -223,6 +224,17 @@ def _print_table(document: dict[str, Any]) -> None:
         click.echo(f"{_named(name)}{content['value']:7.4f} {unit}  {span}")
 
 
+def _left_less_right(
+    document: dict[str, Any], row: dict[str, Any], scale: float, digits: int
+) -> float:
+    """Difference of both sides' values as the table rounds them, beside which it stands."""
+    values = {found["name"]: found["value_m"] for found in document["measurements"]}
+    left, right = (values.get(f"{row['name']}_{side}") for side in ("left", "right"))
+    if left is None or right is None:
+        return round(scale * row["value_m"], digits)
+    return round(round(scale * left, digits) - round(scale * right, digits), digits)
+
+
 def _print_differences(document: dict[str, Any]) -> None:
     """Differences between the sides whose interval does not contain 0."""
     certain = [
@@ -234,9 +246,12 @@ def _print_differences(document: dict[str, Any]) -> None:
         click.echo("Differences between left and right:")
     for row in certain:
         side = "left" if row["value_m"] > 0.0 else "right"
-        size, ends = abs(row["value_m"]), sorted(map(abs, row["interval95_m"]))
+        size, ends = (
+            abs(_left_less_right(document, row, 100.0, 1)),
+            sorted(map(abs, row["interval95_m"])),
+        )
         click.echo(
-            f"{_named(row['name'])}{100 * size:7.1f} cm  {100 * ends[0]:6.1f} to "
+            f"{_named(row['name'])}{size:7.1f} cm  {100 * ends[0]:6.1f} to "
             f"{100 * ends[1]:5.1f}    larger on the {side}"
         )
 

@@ -24,14 +24,12 @@ export async function compare(main, session, first, second) {
     const name = (scan) => `${scan.label || t('result.noLabel')}, ${time(scan.created)}`;
     who.replaceChildren(h('div', {}, t('compare.first', { name: name(found.first) })), h('div', {}, t('compare.second', { name: name(found.second) })));
     head.replaceChildren(h('th', {}, t('result.name')), ...['one', 'two', 'difference'].map((word) => h('th', { className: 'number' }, t(`compare.${word}`))));
-    // The difference of the two numbers that stand beside it.
-    const shown = (value) => Number(value.toFixed(digits()));
     const signed = (value) => (value > 0 ? '+' : '') + value.toFixed(digits());
     body.replaceChildren(...found.rows.map((row) => {
       const look = row.real ? `number real ${row.difference > 0 ? 'up' : 'down'}` : 'number';
       return h('tr', {}, h('td', {}, row.words + (row.side ? ` (${t(`result.${row.side}`)})` : '')),
         h('td', { className: 'number' }, row.first.toFixed(digits())), h('td', { className: 'number' }, row.second.toFixed(digits())),
-        h('td', { className: look }, signed(shown(row.second) - shown(row.first)), h('span', { className: 'small soft' }, ` ± ${row.uncertainty.toFixed(digits())}`)));
+        h('td', { className: look }, signed(row.difference), h('span', { className: 'small soft' }, ` ± ${row.uncertainty.toFixed(digits())}`)));
     }));
     surface.textContent = t('compare.surface', { rms: (1e3 * found.surface_rms_m).toFixed(1), p95: (1e3 * found.surface_p95_m).toFixed(1) });
   });
