@@ -177,7 +177,7 @@ def _attached(content: bytes, media: str, name: str) -> Response:
     "/measurements.csv", response_class=Response, responses=_document("text/csv", "The table")
 )
 def measurements_csv(table: Selected) -> Response:
-    """The table for a spreadsheet."""
+    """The table for a spreadsheet, in words: its verdict is "usable" or "scan again"."""
     text = csv_table(table.record, table.document, table.unit, table.language)
     name = f"{table.record.scan_id}-{table.pose}-{table.unit}.csv"
     return _attached(text.encode(), "text/csv", name)
