@@ -51,8 +51,10 @@ def test_a_cancel_that_overtakes_its_order_cancels_it(one_camera: BoothConfig, l
         while (note := notes.read(scan_id)) is None or note.stage == "armed":
             time.sleep(0.05)
         assert (note.stage, note.reason) == ("failed", CANCELLED)
-        for event in sync._writer.events():
-            sync._handle(event)
+        # The writer tells of it a moment after the note.
+        while sync._cancelled:
+            for event in sync._writer.events():
+                sync._handle(event)
         # It has ended: no order of it comes.
         assert not sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
         assert sync._cancelled == set()
