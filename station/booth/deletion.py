@@ -17,7 +17,7 @@ from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import SpoolError
 from station.core.files import delete
-from station.core.scans import STATES, Notes, ScanId, plain_label, scan_id_of
+from station.core.scans import STATES, Notes, ScanId, boot_id, plain_label, scan_id_of
 from station.core.service import set_up_logs
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
@@ -25,7 +25,7 @@ from station.handover.ledger import Ledger
 _OF_OTHERS = ("cameras", "handover")
 """Folders of the spool whose entries are not named after scans."""
 _ORDER_S = 60.0
-"""Time after which a scan without a bundle is no longer being taken, from its order on."""
+"""Time after which a scan without a bundle is no longer being taken, from its deadline on."""
 
 
 class NoScanError(SpoolError):
@@ -126,9 +126,9 @@ def _removable(
         if lock is None or spool.path("work", scan_id).exists():
             raise SpoolError(f"scan {scan_id} is being reconstructed; try again when it is done")
         note = spool.notes.read(scan_id)
-        if note is not None and note.stage in ("armed", "capturing"):
-            age_s = time.time() - spool.notes.path(scan_id).stat().st_mtime
-            if spool.where(scan_id) is None and 0.0 <= age_s < _ORDER_S:
+        if note is not None and note.stage in ("armed", "capturing") and note.boot == boot_id():
+            over_s = time.monotonic() - note.valid_until_s
+            if spool.where(scan_id) is None and over_s < _ORDER_S:
                 raise SpoolError(f"scan {scan_id} is being taken; try again when it is done")
         now = [spool.path(state, scan_id) for state in STATES] + [spool.notes.path(scan_id)]
         known = (path for path in listed.get(scan_id, ()) if path.parent.name != "locks")

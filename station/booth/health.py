@@ -281,7 +281,7 @@ def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], flo
     problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
     return (
         {state: counts.get(state, 0) for state in STATES if counts.get(state)},
-        max(waiting, default=0.0),
+        max([0.0, *waiting]),
         stuck,
         free,
     )

@@ -148,7 +148,13 @@ class ScanWriter:
             return
         spool.check_space(self._config.spool.min_free_mb)
         rig = booth_rig(self._config)
-        note = ScanNote(order.scan_id, "capturing", label=order.label, boot=boot_id())
+        note = ScanNote(
+            order.scan_id,
+            "capturing",
+            label=order.label,
+            valid_until_s=order.valid_until_s,
+            boot=boot_id(),
+        )
         spool.notes.write(note, durable=False)
         if order.late(time.monotonic()):
             raise BoothError(_DISK_LATE)

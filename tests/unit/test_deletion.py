@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,13 +15,14 @@ from station.archive.index import ScanIndex
 from station.booth.deletion import NoScanError, forget_labels, labelled, purge_scans
 from station.booth.retention import FILE, Deleted, Moment, expire_old
 from station.core.config import RetentionConfig
+from station.core.errors import SpoolError
 from station.core.files import write_json
-from station.core.scans import ScanId, ScanNote
+from station.core.scans import ScanId, ScanNote, Stage, boot_id
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
 
 _DAY_S = 86_400.0
-_ONE, _TWO, _THREE = (ScanId(f"20261121T100000Z-000{n}") for n in (1, 2, 3))
+_ONE, _TWO, _THREE, _FOUR = (ScanId(f"20261121T100000Z-000{n}") for n in (1, 2, 3, 4))
 
 
 @pytest.fixture
@@ -77,6 +79,24 @@ def test_no_worker_takes_a_scan_whose_label_is_being_deleted(
     monkeypatch.setattr(Spool, "remove", with_a_worker)
     purge_scans(spool, [_ONE, _TWO, _THREE], Deleted())
     assert spool.where(_THREE) is None
+
+
+@pytest.mark.parametrize("stage", ["armed", "capturing"])
+@pytest.mark.parametrize("ahead_s", [-3600.0, 0.0, 3600.0])
+def test_a_scan_that_is_being_taken_is_known_whatever_the_wall_clock_says(
+    spool: Spool, stage: Stage, ahead_s: float
+) -> None:
+    """A clock that was set during an order let the scan be deleted, and it went on."""
+    note = ScanNote(_FOUR, stage, valid_until_s=time.monotonic() + 5.0, boot=boot_id())
+    spool.notes.write(note, durable=False)
+    os.utime(spool.notes.path(_FOUR), times=2 * (time.time() - ahead_s,))
+    with pytest.raises(SpoolError, match="is being taken"):
+        purge_scans(spool, [_FOUR], Deleted())
+    # Whoever was to take it ended long ago, or with the last boot.
+    for ended in (replace(note, valid_until_s=time.monotonic() - 61.0), replace(note, boot="x")):
+        spool.notes.write(ended, durable=False)
+        purge_scans(spool, [_FOUR], Deleted())
+        assert spool.notes.ids() == [_ONE, _TWO]
 
 
 def test_what_others_remove_meanwhile_stops_no_deletion(
