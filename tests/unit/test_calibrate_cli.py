@@ -185,9 +185,11 @@ def test_abandoned_calibrations_are_listed(config: Path, store: CalibrationStore
 @pytest.mark.parametrize(
     ("balls", "again", "kept"),
     [
-        (0, False, "nothing was recorded"),
-        (1, False, "what was seen is"),
-        (1, True, "nothing replaces what was seen of the ball before"),
+        (0, "", "nothing was recorded"),
+        (1, "", "what was seen is"),
+        (1, "now", "nothing replaces what was seen of the ball before"),
+        # A step that has nothing to do with the ball repeated it.
+        (1, "before", "what was seen is"),
     ],
 )
 def test_a_step_that_is_stopped_says_what_is_kept(
@@ -195,18 +197,19 @@ def test_a_step_that_is_stopped_says_what_is_kept(
     store: CalibrationStore,
     monkeypatch: pytest.MonkeyPatch,
     balls: int,
+    again: str,
     kept: str,
-    *,
-    again: bool,
 ) -> None:
     """The page, and the command once a step had begun, spoke of what was seen where nothing was."""
 
     def stopped(_: Procedure) -> None:
+        if again == "now":
+            session.begin_run(again=True)
         raise KeyboardInterrupt
 
     session = _begin(store)
     session.record_balls(balls * [ball(next(iter(CAMERAS)), 0.0)])
-    if again:
+    if again == "before":
         session.begin_run(again=True)
     monkeypatch.setattr(Procedure, "empty", stopped)
     with pytest.raises(CalibrationError, match=f"stopped; {kept}"):

@@ -76,10 +76,19 @@ class Attempt:
         )
         return f"kept, and not in use yet: {following}"
 
-    def kept(self) -> str:
-        """Words on what is left of a step that was stopped."""
+    def times_waved_anew(self) -> int:
+        """Number of times that the ball was begun to be waved anew, for `kept`."""
+        return Session.times_waved_anew(self.store.unfinished)
+
+    def kept(self, waved_anew: int) -> str:
+        """Words on what is left of a step that was stopped.
+
+        Args:
+            waved_anew: number of times that the ball had been before it.
+        """
         session = self.unfinished_session()
-        if session is not None and session.replacing:
+        anew = self.times_waved_anew() != waved_anew
+        if session is not None and session.replacing and anew:
             return "nothing replaces what was seen of the ball before, which is kept"
         seen = session is not None and session.anything
         return "what was seen is kept" if seen else "nothing was recorded"

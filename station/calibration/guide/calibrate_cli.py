@@ -75,11 +75,13 @@ def _called(
     procedure = Procedure(config, store, recordings, guide)
     if kwargs.get("list_them"):
         return command(procedure, *args, **kwargs)
+    waved_anew = procedure.times_waved_anew()
     try:
         with store.locked():
             return command(procedure, *args, **kwargs)
     except (KeyboardInterrupt, click.Abort):
-        click.echo(f"  stopped; {procedure.kept()}; station calibrate goes on from here")
+        kept = procedure.kept(waved_anew)
+        click.echo(f"  stopped; {kept}; station calibrate goes on from here")
         raise
     finally:
         guide.end_line()

@@ -93,6 +93,16 @@ class Session(Seen):
         """Moment at which a calibration was begun, without reading what it has seen."""
         return str(read_json(folder / SESSION, format=FORMAT, versions=VERSIONS).get("started"))
 
+    @staticmethod
+    def times_waved_anew(folder: Path) -> int:
+        """Number of times that the ball was begun to be waved anew, without reading what was seen.
+
+        Raises:
+            OSError: the folder cannot be read.
+        """
+        path = folder / JOURNAL
+        return path.read_bytes().count(_line({"step": _RUN_AGAIN})) if path.exists() else 0
+
     @classmethod
     def load(cls, folder: Path, *, mend: bool = True) -> Session:
         """Read what an interrupted calibration has seen.
@@ -178,8 +188,8 @@ class Session(Seen):
         """One line, durably, and into memory."""
         path = self.folder / JOURNAL
         is_new = not path.exists()
-        line = json.dumps(entry, allow_nan=False, separators=(",", ":")) + "\n"
-        with path.open("a") as stream:
+        line = _line(entry)
+        with path.open("ab") as stream:
             stream.write(line)
             stream.flush()
             os.fsync(stream.fileno())
@@ -279,6 +289,11 @@ class Session(Seen):
             before = [ball.time_s for ball in self.balls]
             self._later_s = max(before) + _BETWEEN_RUNS_S - first_s if before else 0.0
         return self._later_s
+
+
+def _line(entry: Mapping[str, Any]) -> bytes:
+    """An entry as a line of the journal."""
+    return (json.dumps(entry, allow_nan=False, separators=(",", ":")) + "\n").encode()
 
 
 def _lens(document: Mapping[str, Any], camera: CameraCalibration) -> Lens:

@@ -93,6 +93,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
     guide = PageGuide(recordings is None, config.calibrate.countdown_s)
     procedure = Procedure(config, store, recordings, guide)
     alone = step not in ("all", "solve")
+    waved_anew = procedure.times_waved_anew()
     try:
         with store.locked():
             if new:
@@ -101,7 +102,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
                 procedure.tell_of_replay()
             _do(procedure, step)
     except KeyboardInterrupt:
-        raise CalibrationError(f"stopped; {procedure.kept()}") from None
+        raise CalibrationError(f"stopped; {procedure.kept(waved_anew)}") from None
     if alone:
         guide.say(procedure.following("the computation puts it into use"))
 
