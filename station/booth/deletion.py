@@ -121,7 +121,7 @@ def _removable(
     Args:
         listed: the spool's `traces`, since when the scan may have gone on.
     """
-    lock = spool.lock(scan_id)
+    lock = spool.lock(scan_id, to_delete=True)
     try:
         if lock is None or spool.path("work", scan_id).exists():
             raise SpoolError(f"scan {scan_id} is being reconstructed; try again when it is done")

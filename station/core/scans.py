@@ -134,6 +134,23 @@ def sweep_unwritten(folder: Path) -> None:
                 delete(entry)
 
 
+def writer_lives(name: str) -> bool:
+    """Whether the process that made a temporary name (`name.<pid>.<ns>`) still runs.
+
+    Its number may be another process's by now, and is after each boot.
+    """
+    *_, pid, made_ns = ["", "", *name.split(".")]
+    if not (pid.isdecimal() and made_ns.isdecimal()):
+        return False
+    try:
+        # What follows the name, which may have any characters: its start, in ticks since the boot.
+        started = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        return False
+    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return started / os.sysconf("SC_CLK_TCK") <= int(made_ns) / 1e9 <= now_s
+
+
 class Notes:
     """The notes of all scans of a spool."""
 

@@ -8,11 +8,11 @@ system. The folders are described in `station.core.scans`.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import logging
 import os
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from station.core.files import (
 )
 from station.core.scans import (
     REASON,
+    STATES,
     ScanFolders,
     ScanId,
     ScanNote,
@@ -36,11 +37,14 @@ from station.core.scans import (
     boot_id,
     is_scan_id,
     sweep_unwritten,
+    writer_lives,
 )
 
 MAX_DEATHS = 10
 """Ends of the station, unlike those of a job, do not count as tries of a scan; a scan during which
 the station ends this often is given up."""
+_IN_EACH = ("bundle.json", "result.json")
+"""Every bundle, and every result, has one of these."""
 _LOG = logging.getLogger("spool")
 
 
@@ -198,7 +202,7 @@ class Spool(ScanFolders):
         """Remove leftovers of dead writers, except those that a delivery still needs."""
         needed = {note.result for scan_id in self.scans_in("work") if (note := self.note(scan_id))}
         for entry in (self.folder / "tmp").iterdir():
-            if entry.name in needed or _writer_lives(entry.name):
+            if entry.name in needed or writer_lives(entry.name):
                 continue
             # As much of a folder as the disk lets go.
             shutil.rmtree(entry, ignore_errors=True)
@@ -209,11 +213,21 @@ class Spool(ScanFolders):
         for folder in (self.folder, *self.folder.glob("handover/*/waiting")):
             sweep_unwritten(folder)
 
-    def lock(self, scan_id: ScanId) -> int | None:
-        """The scan's lock, or None while a living process holds it."""
+    def lock(self, scan_id: ScanId, *, to_delete: bool = False) -> int | None:
+        """The scan's lock, or None while a living process holds it.
+
+        Args:
+            to_delete: where no further file can be made, a file of the scan is its lock.
+        """
         path = self.folder / "locks" / f"{scan_id}.lock"
         while True:
-            descriptor = open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
+            try:
+                descriptor = open_private(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW)
+            except OSError as error:
+                full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+                if not (to_delete and full and self._link(scan_id, path)):
+                    raise
+                continue
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Its previous holder removes the file: a lock on a removed file locks nothing.
@@ -230,28 +244,24 @@ class Spool(ScanFolders):
                 raise
             os.close(descriptor)
 
+    def _link(self, scan_id: ScanId, lock: Path) -> bool:
+        """Give a file of the scan a second name, for which a full disk has room: its lock's."""
+        files = (self.path(state, scan_id) / name for state in STATES for name in _IN_EACH)
+        for path in (self.notes.path(scan_id), *files):
+            try:
+                os.link(path, lock, follow_symlinks=False)
+                return True
+            except FileExistsError:
+                return True
+            except OSError:
+                continue
+        return False
+
     def unlock(self, scan_id: ScanId, lock: int) -> None:
         """Release a scan's lock and remove its file, so that no name outlives its scan."""
         with contextlib.suppress(OSError):
             (self.folder / "locks" / f"{scan_id}.lock").unlink()
         os.close(lock)
-
-
-def _writer_lives(name: str) -> bool:
-    """Whether the process that made a temporary name (`name.<pid>.<ns>`) still runs.
-
-    Its number may be another process's by now, and is after each boot.
-    """
-    *_, pid, made_ns = ["", "", *name.split(".")]
-    if not (pid.isdecimal() and made_ns.isdecimal()):
-        return False
-    try:
-        # What follows the name, which may have any characters: its start, in ticks since the boot.
-        started = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
-    except (OSError, ValueError, IndexError):
-        return False
-    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
-    return started / os.sysconf("SC_CLK_TCK") <= int(made_ns) / 1e9 <= now_s
 
 
 class Claim:

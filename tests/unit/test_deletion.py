@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -97,6 +99,35 @@ def test_a_scan_that_is_being_taken_is_known_whatever_the_wall_clock_says(
         spool.notes.write(ended, durable=False)
         purge_scans(spool, [_FOUR], Deleted())
         assert spool.notes.ids() == [_ONE, _TWO]
+
+
+def test_scans_are_deleted_where_no_file_can_be_made(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each needed a file for its lock, which only a deletion would have made room for."""
+    other, opened = Spool(spool.folder), os.open
+
+    def full(path: str | Path, flags: int, *mode: int, **options: Any) -> int:
+        if flags & os.O_CREAT and not os.path.lexists(path):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return opened(path, flags, *mode, **options)
+
+    def refuses(scan_id: ScanId) -> None:
+        with pytest.raises(SpoolError, match="is being reconstructed"):
+            purge_scans(other, [scan_id], Deleted())
+
+    monkeypatch.setattr(os, "open", full)
+    # Nothing else is begun there.
+    with pytest.raises(OSError, match="No space left"):
+        spool.claim()
+    for scan_id in (_ONE, _TWO, _THREE):
+        lock = spool.lock(scan_id, to_delete=True)
+        assert lock is not None
+        refuses(scan_id)
+        assert other.lock(scan_id) is None
+        spool.unlock(scan_id, lock)
+    purge_scans(spool, [_ONE, _TWO, _THREE], Deleted())
+    assert [path for path in spool.folder.rglob("*") if path.name.startswith("20261121")] == []
 
 
 def test_what_others_remove_meanwhile_stops_no_deletion(
