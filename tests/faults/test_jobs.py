@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,17 @@ main()
 """
 
 
+_COMPILES = """
+def warm_up():
+    import numba, time
+    numba.njit(lambda: 1)()
+    while not os.path.exists("{done}"):
+        time.sleep(0.01)
+
+job.warm_up = warm_up
+"""
+
+
 def _outcome(folder: Path, monkeypatch: pytest.MonkeyPatch, act: str) -> Outcome:
     (folder / "spoilt_job.py").write_text(_MODULE.format(act=act))
     monkeypatch.setenv("PYTHONPATH", str(folder))
@@ -47,6 +59,27 @@ def _outcome(folder: Path, monkeypatch: pytest.MonkeyPatch, act: str) -> Outcome
     outcome = process.outcome(timeout_s, threading.Event(), begun.set)
     process.kill()
     return outcome
+
+
+def test_a_job_that_is_compiled_first_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = tmp_path / "compiled"
+    *module, end = _MODULE.format(act="pass").splitlines()
+    lines = [*module, _COMPILES.format(done=compiled), end]
+    (tmp_path / "first_job.py").write_text("\n".join(lines))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    process = JobProcess("first_job")
+    config = BoothConfig(cameras=(RecordedCamera(name="a", recording=Path("a")),))
+    process.send(tmp_path, tmp_path, config)
+    with ThreadPoolExecutor(1) as beside:
+        ending = beside.submit(process.outcome, 100.0, threading.Event(), lambda: None)
+        while not process.compiling:
+            assert not ending.done()
+            time.sleep(0.01)
+        compiled.touch()
+        assert ending.result() == Outcome(status="ok")
+    assert not process.compiling
 
 
 @pytest.mark.parametrize(

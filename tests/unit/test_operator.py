@@ -20,6 +20,7 @@ from station.booth.operator import asking, scan_cli
 from station.booth.operator.scan_cli import _follow, scan, show_result
 from station.booth.operator.sensors_cli import cancel, start, stop
 from station.booth.operator.status_cli import status
+from station.booth.session import FINAL
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, FormatError
 from station.core.files import held
@@ -140,6 +141,29 @@ def test_a_reconstruction_counts_its_seconds_on_one_line(
     else:
         assert told[0] == "reconstructing (0 s)"
         assert "reconstructing (1 s)" in told
+
+
+def test_a_reconstruction_that_is_compiled_first_says_so(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first one takes a minute longer than any other, and nobody knew why."""
+    states = iter(["accepted", *4 * ["reconstructing"], "delivered"])
+    compiling = iter([False, True, True, False])
+
+    def answer(*_: object) -> dict[str, Any]:
+        return {"state": next(states), "reason": "", "wanted": 0, "framesets": 0}
+
+    def health(_: Path, process: str) -> dict[str, bool]:
+        return {"compiling": process == "workers" and next(compiling)}
+
+    monkeypatch.setattr(scan_cli, "_ask_until_answered", answer)
+    monkeypatch.setattr(scan_cli, "read_health", health)
+    order = Request("scan", "a")
+    _follow(one_camera, order, answer(), FINAL.__contains__, time.monotonic() + 60.0)
+    told = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    about = [line for line in told if "compiled" in line]
+    assert about == ["the reconstruction is being compiled, once on this machine: a minute or two"]
+    assert told[-1] == "delivered"
 
 
 def test_a_long_label_is_refused_by_control_and_not_cut_here(

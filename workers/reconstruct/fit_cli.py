@@ -78,7 +78,12 @@ def fit(
         if source is not None and not source.exists():
             raise InputError(f"{source} does not exist")
     _check_folders(out_folder, debug_folder)
+    from workers.reconstruct.compiling import COMPILING, compilation_told
     from workers.reconstruct.job import reconstruct_bundle
+
+    def tell_of_compilation() -> None:
+        if not quiet:
+            click.echo(COMPILING, err=True)
 
     def show(step: str, share: float) -> None:
         if not quiet:
@@ -87,11 +92,12 @@ def fit(
     temporary = Path(tempfile.mkdtemp(prefix=".fit-", dir=out_folder.parent))
     try:
         options = {"method": method, "progress": show, **_observation(debug_folder)}
-        if bundle is not None:
-            summary = reconstruct_bundle(bundle, temporary, **options)
-        else:
-            assert cloud is not None
-            summary = _of_cloud(cloud, up, unit, temporary, options)
+        with compilation_told(tell_of_compilation):
+            if bundle is not None:
+                summary = reconstruct_bundle(bundle, temporary, **options)
+            else:
+                assert cloud is not None
+                summary = _of_cloud(cloud, up, unit, temporary, options)
         _publish(temporary, out_folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

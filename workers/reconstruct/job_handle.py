@@ -48,6 +48,8 @@ class JobProcess:
     """One warmed-up process for one job."""
 
     def __init__(self, module: str = "workers.reconstruct.job_process") -> None:
+        self.compiling = False
+        """Code that a job needs is being compiled, as it is once after an installation."""
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, str(os.getpid())],
             stdin=subprocess.PIPE,
@@ -133,6 +135,7 @@ class JobProcess:
                 *lines, pending = (pending + piece).split(b"\n")
                 for line in lines:
                     last = json.loads(line)
+                    self.compiling = "compiling" in last
                     if "ready" in last:
                         ready, deadline_s = True, time.monotonic() + timeout_s
                 if not at_work and "step" in last:

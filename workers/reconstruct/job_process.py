@@ -1,9 +1,9 @@
 """A process that warms up, does one job and ends: what it holds or leaks ends with it.
 
-Communicates by JSON lines: it says {"ready": true}, reads one {"bundle", "out", "method",
-"volume"}, reports {"step", "share"} and ends with {"status", "reasons", "evidence"}, {"error"} (the
-scan cannot be used), {"disk"} (the disk refused, not the fault of the scan) or {"died"}. Its first
-argument is the process to end with.
+Communicates by JSON lines: it says {"compiling": true} if code has to be compiled, {"ready": true},
+reads one {"bundle", "out", "method", "volume"}, reports {"step", "share"} and ends with {"status",
+"reasons", "evidence"}, {"error"} (the scan cannot be used), {"disk"} (the disk refused, not the
+fault of the scan) or {"died"}. Its first argument is the process to end with.
 """
 
 from __future__ import annotations
@@ -40,10 +40,12 @@ def main() -> None:
     # Libraries print to stdout; the pipe to the pool must carry only messages of this process.
     channel = os.dup(1)
     os.dup2(2, 1)
+    from workers.reconstruct.compiling import compilation_told
     from workers.reconstruct.job import reconstruct_bundle, warm_up
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
-    model = warm_up()
+    with compilation_told(lambda: _say(channel, {"compiling": True})):
+        model = warm_up()
     _say(channel, {"ready": True})
     line = sys.stdin.readline()
     if not line:

@@ -53,6 +53,7 @@ class Worker:
     ) -> None:
         self._config, self._spool, self._stop, self._log = config, spool, stop, log
         self._spare: JobProcess | None = None
+        self._busy: JobProcess | None = None
         self.scan_id: ScanId | None = None
         self.problem = ""
         self.delivered = self.failed = 0
@@ -101,13 +102,14 @@ class Worker:
             return False
         self.scan_id = claim.scan_id
         process, self._spare = self._spare, None
+        self._busy = process
         try:
             self._do(claim, process)
         except OSError:
             claim.release()
             raise
         finally:
-            self.scan_id = None
+            self.scan_id = self._busy = None
             process.kill()
             claim.close()
         return True
@@ -135,6 +137,11 @@ class Worker:
             return
         shutil.rmtree(out, ignore_errors=True)
         self._settle(claim, outcome)
+
+    @property
+    def compiling(self) -> bool:
+        """Whether its scan waits until what a job needs is compiled."""
+        return self._busy is not None and self._busy.compiling
 
     def _warm_another(self) -> None:
         """The next job's process warms up while this one works."""
@@ -204,6 +211,7 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
             heart.report(
                 {
                     "busy": [w.scan_id for w in workers if w.scan_id],
+                    "compiling": any(w.compiling for w in workers),
                     "threads": sum(w.thread.is_alive() for w in workers),
                     "delivered": sum(w.delivered for w in workers),
                     "failed": sum(w.failed for w in workers),

@@ -20,7 +20,7 @@ from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
-from station.core.service import STATION_LOCK
+from station.core.service import STATION_LOCK, read_health
 from station.core.words.terms import verdict_words
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError
@@ -39,6 +39,7 @@ _WORDS = {
     "accepted": "scan accepted: the person may leave",
     "reconstructing": "reconstructing",
 }
+_COMPILING = "the reconstruction is being compiled, once on this machine: a minute or two"
 _CHANGING = (_WORDS["capturing"], _WORDS["reconstructing"])
 
 
@@ -119,7 +120,7 @@ def _follow(
 ) -> dict[str, Any]:
     """Show each new state on a line of its own until it is enough."""
     scan_id = order.scan_id
-    free, sure_s = False, time.monotonic()
+    free, told, sure_s = False, False, time.monotonic()
     begun_s: float | None = None
     with closing(_Line()) as line:
         while True:
@@ -144,6 +145,9 @@ def _follow(
                 words = UNSURE
             if session["reason"] == CANCELLED:
                 words = "cancelled"
+            if state == "reconstructing" and not told and _compiles(config):
+                told = True
+                line.show(_COMPILING)
             line.show(words, changes=words.startswith(_CHANGING))
             if enough(state):
                 return session
@@ -157,6 +161,11 @@ def _follow(
             unsure = session["reason"] == UNSURE
             request = order if unsure else Request("scan-status", scan_id)
             session = _ask_until_answered(config, request, line)
+
+
+def _compiles(config: BoothConfig) -> bool:
+    """Whether a scan waits for the first reconstruction to be compiled."""
+    return bool(read_health(config.runtime.folder, "workers").get("compiling"))
 
 
 class _Line:
