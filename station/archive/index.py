@@ -183,7 +183,8 @@ class ScanIndex:
                 if rows.get(scan_id) != place:
                     self._take(database, place, scan_id)
             now_ns = time.time_ns()
-            settled = {p: ns if now_ns - ns > _SETTLED_NS else 0 for p, ns in changed.items()}
+            # A clock that was put back since does not come to the same tick before long.
+            settled = {p: ns if abs(now_ns - ns) > _SETTLED_NS else 0 for p, ns in changed.items()}
             database.executemany(
                 "INSERT OR REPLACE INTO folders VALUES (?, ?)", list(settled.items())
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import threading
 import time
@@ -17,7 +18,10 @@ import open3d
 import pytest
 import zmq
 
+from station.archive import index
 from station.archive.compare import compare_surfaces
+from station.archive.index import ScanIndex
+from station.archive.records import PLACES, ScanRecord
 from station.archive.surfaces import _FACE
 from station.booth.deletion import purge_scans
 from station.booth.health import booth_health
@@ -28,6 +32,7 @@ from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
 from station.console.live.watch import Watch
+from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.scans import CANCELLED, ScanId, ScanNote, scan_id_of
 from station.core.spool import Spool
@@ -142,6 +147,38 @@ def test_no_distances_of_a_deleted_body_are_kept(watch: tuple[Watch, EventLog]) 
     )
     purge_scans(spool, ["a"], Deleted())
     _until(lambda: compare_surfaces.cache_info().currsize == 0)
+
+
+def test_a_clock_that_was_put_back_lets_the_watch_rest(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All scans were listed ten times a second until the clock had caught up."""
+    spool, looks = Spool(one_camera.spool.folder), list[str]()
+    find, names = ScanIndex.find, index._names
+
+    def found(self: ScanIndex, **options: Any) -> list[ScanRecord]:
+        looks.append("index")
+        return find(self, **options)
+
+    def named(folder: Path) -> list[str]:
+        looks.append("folder")
+        return names(folder)
+
+    monkeypatch.setattr(ScanIndex, "find", found)
+    monkeypatch.setattr(index, "_names", named)
+    watching = Watch(one_camera, EventLog(), logging.getLogger())
+    for place in PLACES:
+        os.utime(spool.folder / place, times=2 * (time.time() + 3600.0,))
+    watching._watch_spool(False)
+    assert set(looks) == {"index", "folder"}
+    looks.clear()
+    watching._watch_spool(False)
+    assert looks == []
+    watching._watch_spool(True)
+    assert looks == ["index"]
+    spool.path("failed", "a").mkdir()
+    watching._watch_spool(False)
+    assert set(watching._seen or {}) == {"a"}
 
 
 def test_a_result_that_is_taken_away_is_not_said_to_be_deleted(

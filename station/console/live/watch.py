@@ -34,6 +34,8 @@ _SILENT_S = 1.3
 """Health is sent twice a second; two missing reports mean that the capture process is gone."""
 _HANGS_S = 2.0
 """A round takes milliseconds; the supervisor waits longer before it acts."""
+_SETTLED_NS = 1_000_000_000
+"""A folder that changed this recently is looked at again."""
 _RECENT = 1000
 _DELETION_S = 3.0
 """Time from the removal of a result to that of its note, on a busy disk."""
@@ -212,7 +214,9 @@ class Watch:
             (folder / place).stat().st_mtime_ns for place in PLACES if (folder / place).is_dir()
         )
         settled = changed == self._spool_ns and not moved
-        if settled and time.time_ns() - max(changed, default=0) > 1_000_000_000:
+        now_ns = time.time_ns()
+        # Also where the clock was put back since, as in the index.
+        if settled and all(abs(now_ns - moment_ns) > _SETTLED_NS for moment_ns in changed):
             return
         self._spool_ns = changed
         # No distances of a body are kept that may have been deleted.
