@@ -73,6 +73,25 @@ def test_an_operator_looks_scans_and_reads_the_result(console: LiveConsole) -> N
     assert errors == []
 
 
+def test_a_scan_that_waits_for_the_compiler_says_so(console: LiveConsole) -> None:
+    """The first one took a minute longer than any other, and nobody knew why."""
+
+    def first(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "compiling": True})
+
+    with browser() as started:
+        page = tablet(started).new_page()
+        page.route("**/api/v1/booth", first)
+        log_in(page, console)
+        open_view(page, console, "scan")
+        compiled = page.locator("#stage").get_by_text("being compiled, once on this computer")
+        page.click("#go")
+        expect(compiled).to_be_visible(timeout=5 * LONG_MS)
+        expect(page.locator("#stage .word")).to_have_text("Measuring the body")
+        expect(page.locator("#verdict")).to_be_visible(timeout=5 * LONG_MS)
+        expect(compiled).to_have_count(0)
+
+
 def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:
     with browser() as started:
         page = tablet(started).new_page()

@@ -209,7 +209,7 @@ def test_what_status_says_is_said_by_the_console(
     assert (watching.booth()["problems"], watching.booth()["can_scan"]) == ([], False)
 
     def answered(problems: Sequence[str], **sync: Any) -> Callable[..., Any]:
-        processes = {"control": {"age_s": 0.1}}
+        processes = {"control": {"age_s": 0.1}, "workers": {"age_s": 0.1, "compiling": True}}
         told = {"streaming": True, "processes": processes, "free_bytes": 1e12}
         return lambda *_: {**told, "sync": {"silent": [], **sync}, "problems": problems}
 
@@ -229,12 +229,13 @@ def test_what_status_says_is_said_by_the_console(
     _until(lambda: booth() == ([], True))
     monkeypatch.setattr(watch_module, "command", answered(["camera a: torn"], silent=["a"]))
     _until(lambda: booth() == (["camera a: torn"], False))
+    assert watching.booth()["compiling"]
 
     def silent(*_: object) -> None:
         raise NotRunningError("nothing runs")
 
     monkeypatch.setattr(watch_module, "command", silent)
-    _until(lambda: booth() == ([], False))
+    _until(lambda: booth() == ([], False) and not watching.booth()["compiling"])
 
 
 def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> None:

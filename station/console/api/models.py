@@ -79,6 +79,9 @@ class BoothState(BaseModel):
     can_scan: bool = Field(
         description="nothing is in the way of a scan, other than sensors that are stopped"
     )
+    compiling: bool = Field(
+        description="a scan waits until the reconstruction is compiled, once on a machine"
+    )
     streaming: bool
     cameras: list[Camera]
     framesets_hz: float | None

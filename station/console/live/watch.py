@@ -114,6 +114,7 @@ class Watch:
             "fault": self._fault,
             "problems": list(status.get("problems", [])),
             "can_scan": bool(status) and can_scan(self._config, status),
+            "compiling": bool(status.get("processes", {}).get("workers", {}).get("compiling")),
             "streaming": bool(self._status.get("streaming", False)),
             "cameras": [camera.document() for camera in self._cameras.values()],
             "framesets_hz": self._rate_hz,

@@ -33,6 +33,7 @@ export async function scan(main, session) {
   const stage = h('section', { className: 'card stage', id: 'stage', 'aria-live': 'polite' });
   let streaming = state.streaming;
   let able = state.can_scan;
+  let compiling = state.compiling;
   let asked = false;
   let label = '';
   let current = null;
@@ -131,7 +132,7 @@ export async function scan(main, session) {
     const ring = h('div', { className: 'ring' },
       s('svg', { viewBox: '0 0 232 232', 'aria-hidden': 'true' }, s('circle', circle), done), word);
     const leave = h('p', { className: 'leave', id: 'leave', hidden: true }, t('scan.leave'));
-    const below = h('p', {}, t('scan.countdown'));
+    const below = h('p');
     const give = h('button', { id: 'give-up', onclick: giveUp }, t('scan.give'));
     stage.replaceChildren(h('h2', {}, current.label || t('result.noLabel')), leave, ring, below, give);
     parts = { done, word, ring, leave, below, give };
@@ -154,7 +155,9 @@ export async function scan(main, session) {
     word.className = counting ? 'number' : 'word';
     if (word.textContent !== words) word.textContent = words;
     leave.hidden = !free;
-    below.hidden = !counting;
+    const waits = compiling && current.state === 'reconstructing';
+    below.hidden = !counting && !waits;
+    below.textContent = t(waits ? 'scan.compiling' : 'scan.countdown');
     give.hidden = taken || current.state === 'reconstructing';
   }
 
@@ -231,6 +234,8 @@ export async function scan(main, session) {
       showTroubles(told);
       able = told.can_scan;
       allow();
+      compiling = told.compiling;
+      if (current?.state === 'reconstructing') show();
     } catch { /* the connection's loss is told elsewhere */ }
   }
 
