@@ -1,10 +1,11 @@
-"""One virtual booth for all tests: four recordings of a person that no model was trained on."""
+"""Body model, and a virtual booth with a person unknown to it, which many tests share."""
 
 from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from running_station import STATION, Station
@@ -12,6 +13,9 @@ from xdist.scheduler import LoadFileScheduling
 
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
+
+if TYPE_CHECKING:
+    from workers.scape.model.body_model import BodyModel
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 
@@ -53,6 +57,14 @@ def one_camera(tmp_path: Path) -> BoothConfig:
     path = tmp_path / "booth.toml"
     path.write_text(_ONE_CAMERA)
     return load_config(path)
+
+
+@pytest.fixture(scope="session")
+def model() -> BodyModel:
+    """The body model, with what is kept of it."""
+    from workers.scape.model.body_model import load_model
+
+    return load_model()
 
 
 @pytest.fixture(scope="session")

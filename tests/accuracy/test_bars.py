@@ -24,15 +24,10 @@ from station.core.bundle import read_bundle
 from station.simulation.sensor import SimulatedBooth
 from workers.cloud.preprocess import preprocess
 from workers.scape.fit.fit import fit_body
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 
 BODIES = 2
 HARD = ("no front-upper", "camera 5 mm off", "arms close")
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

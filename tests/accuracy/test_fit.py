@@ -24,16 +24,11 @@ from workers.measure.body import measure_body
 from workers.reconstruct.job import reconstruct_bundle
 from workers.scape.fit.fit import FitResult, fit_body, sampling_of
 from workers.scape.fit.initial import starting_states
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.intersections import self_intersections, turned_over
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

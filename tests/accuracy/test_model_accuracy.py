@@ -19,11 +19,6 @@ BODIES = 3
 
 
 @pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
-
-
-@pytest.fixture(scope="module")
 def database() -> BodyDatabase:
     return body_database()
 

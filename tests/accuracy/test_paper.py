@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from workers.cloud.observed import PointCloud
 from workers.scape.fit.normal_equations import Target
 from workers.scape.fit.paper import fit_like_the_paper
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
 
 _LOST_M = 0.02
 """Without the weights of pairs and the parents' turn the forearm ends 54 mm away."""
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def test_an_arm_out_of_reach_comes_back_with_its_shoulder(model: BodyModel) -> None:

@@ -11,14 +11,9 @@ from station.core.bundle import read_bundle
 from station.core.geometry import so3_exp
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import signed_volume
 from workers.scape.model.sampled import SampledBody
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

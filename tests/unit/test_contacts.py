@@ -5,15 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.surface.contacts import parted
 from workers.scape.surface.crossings import crossing_pairs
 from workers.scape.surface.intersections import self_intersections, untangled
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

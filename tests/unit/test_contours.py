@@ -8,7 +8,7 @@ import pytest
 
 from station.simulation.scene import Mesh, VirtualScene, booth_walls, default_rig
 from workers.cloud.observed import CameraView, PointCloud
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.contours import (
     _edges_on_lines,
@@ -22,11 +22,6 @@ from workers.scape.surface.displacement import fit_surface
 CAMERAS = [default_rig().cameras[name] for name in ("front-lower", "back-lower")]
 POSES = [camera.world_from_camera for camera in CAMERAS]
 RIGHT_SIDES = [1, 3]
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from workers.cloud.observed import CameraView, PointCloud
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.evidence.crown import _outline, crown_rows, crown_sigma_m
 from workers.scape.evidence.rows import Rows
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.displacement import fit_surface
 
@@ -30,11 +30,6 @@ POSE = UPPER.world_from_camera
 ROLLED = POSE @ rigid(so3_exp([0.0, 0.0, 0.5 * np.pi]), np.zeros(3))
 TURNED = POSE @ rigid(so3_exp([0.0, 0.0, np.pi]), np.zeros(3))
 HIGHER = np.array([0.0, 0.0, 0.006])
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

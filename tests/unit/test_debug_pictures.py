@@ -13,13 +13,8 @@ from station.core.errors import InputError
 from workers.pictures.debug_pictures import DebugPictures
 from workers.pictures.render import BACKGROUND
 from workers.reconstruct.fit_cli import fit
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _ink(path: Path) -> float:

@@ -17,15 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.measure.body import Measurement, measure_body
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState
 
 KHRONOS = Path(__file__).parents[1] / "khronos"
 Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,8 @@ import pytest
 
 from workers.scape.evidence.correspondence import OrientedTree
 from workers.scape.fit.hands import hands_of, place_hands
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import vertex_normals
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _with_fingers(model: BodyModel, curl_sd: float, turn_sd: float) -> BodyState:

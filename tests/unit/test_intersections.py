@@ -9,15 +9,10 @@ import open3d as o3d
 import pytest
 from numpy.typing import NDArray
 
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.deformation import triangle_areas, vertex_normals
 from workers.scape.surface.crossings import crossing_pairs
 from workers.scape.surface.intersections import self_intersections, turned_over, untangled
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _random_body(model: BodyModel, seed: int) -> np.ndarray:

@@ -14,13 +14,8 @@ from workers.measure.intervals import (
     ScanErrors,
     learned,
 )
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from station.simulation.scene import sphere
 from workers.scape.evidence.correspondence import OrientedTree, TrackedPoints
 from workers.scape.fit.initial import RoughPose, rotations_of, starting_states
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import (
     EdgeSolver,
     area_vectors,
@@ -25,11 +25,6 @@ from workers.scape.model.sampled import SampledBody
 
 LIMITS = {"max_distance_m": 0.03, "max_angle_rad": float(np.radians(50.0))}
 BALL = sphere((0.1, 0.2, 1.0), 0.3)
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def test_normals_are_sums_of_cross_products() -> None:

@@ -21,12 +21,7 @@ from workers.measure.sections import loop_length
 from workers.measure.standing import on_both_feet, standard_state
 from workers.measure.tracing import trace_all
 from workers.scape.learn.landmarks import landmarks
-from workers.scape.model.body_model import BodyModel, load_model
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
+from workers.scape.model.body_model import BodyModel
 
 
 def _values(model: BodyModel, vertices: np.ndarray) -> dict[str, float]:

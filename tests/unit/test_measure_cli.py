@@ -16,14 +16,9 @@ from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
 from workers.reconstruct.measure_cli import measure
 from workers.scape.fit.verdict import Verdict
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 
 VERDICT = Verdict("rescan", ("the left arm is hidden",), (), ("hand_left", "forearm_left"))
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _run(*words: str) -> str:

@@ -12,11 +12,6 @@ from workers.scape.model.body_model import SHIPPED, BodyModel, BodyState, load_m
 from workers.scape.model.sampled import SampledBody
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
-
-
 def _some_state(model: BodyModel) -> BodyState:
     rng = np.random.default_rng(0)
     twists = 0.15 * rng.standard_normal((model.part_count, 3))

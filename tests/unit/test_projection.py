@@ -2,20 +2,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from workers.scape.fit.sampling import Sampling
 from workers.scape.learn.projection import PROJECTION_STRIDE, best_fit
 from workers.scape.learn.registration import distances, register
-from workers.scape.model.body_model import BodyModel, BodyState, load_model
+from workers.scape.model.body_model import BodyModel, BodyState
 from workers.scape.model.sampled import SampledBody
 
 BODIES = Path(__file__).parents[2] / "station/simulation/bodies"
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _some_state(model: BodyModel) -> BodyState:

@@ -16,14 +16,9 @@ from workers.export.preview import _label, _spread, preview, views_of
 from workers.measure.body import Measurement, measure_body
 from workers.pictures.render import BACKGROUND, Frame, Scene
 from workers.scape.fit.verdict import Verdict
-from workers.scape.model.body_model import BodyModel, load_model
+from workers.scape.model.body_model import BodyModel
 
 OK = Verdict("ok", ())
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,7 @@ from workers.measure.intervals import (
 )
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
-from workers.scape.model.body_model import BodyModel, load_model
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
+from workers.scape.model.body_model import BodyModel
 
 
 def test_standing_takes_the_scanned_pose_away(model: BodyModel) -> None:

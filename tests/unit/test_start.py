@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from workers.scape.fit.initial import is_head_hidden, taller
-from workers.scape.model.body_model import BodyModel, load_model
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
+from workers.scape.model.body_model import BodyModel
 
 
 def test_a_head_is_hidden_where_only_its_face_gives_points(model: BodyModel) -> None:

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from workers.cloud.observed import PointCloud
-from workers.scape.model.body_model import HAND, BodyModel, load_model
+from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.surface.attachment import attached
 from workers.scape.surface.displacement import fit_surface
@@ -22,11 +22,6 @@ from workers.scape.surface.offset_prior import RANGE_M, OffsetPrior, offset_prio
 from workers.scape.surface.uncertainty import hidden_head_sigma, surface_sigma
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _grid(side: int, size_m: float) -> tuple[Array, NDArray[np.int32]]:
@@ -180,9 +175,8 @@ def test_a_missing_limb_is_known_the_less_the_farther_it_reaches(model: BodyMode
     assert sigma[model.mean[:, 2] < 0.1].min() > 0.005
 
 
-def test_hair_hides_the_skin_below_the_top_as_well() -> None:
+def test_hair_hides_the_skin_below_the_top_as_well(model: BodyModel) -> None:
     """Chin and girths of the head were stated as if only the top were doubtful."""
-    model = load_model()
     head = model.part_of_vertex == model.part_names.index("head")
     face = model.mean[:, 1] < np.median(model.mean[head, 1])
     seen = ~head | face

@@ -13,12 +13,7 @@ from workers.measure.coverage import SeenSkin
 from workers.measure.intervals import ScanErrors
 from workers.measure.kinds import TRUNK_ENDS
 from workers.measure.tracing import trace_all
-from workers.scape.model.body_model import BodyModel, load_model
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
+from workers.scape.model.body_model import BodyModel
 
 
 @pytest.mark.filterwarnings("error")

@@ -13,15 +13,10 @@ from workers.scape.evidence.inside import shares_inside
 from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
 from workers.scape.fit.verdict import PartReport, judge, lost_parts
-from workers.scape.model.body_model import FLOOR, BodyModel, load_model
+from workers.scape.model.body_model import FLOOR, BodyModel
 from workers.scape.model.deformation import vertex_normals
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
 
 
 def _scan_of(model: BodyModel, vertices: Array) -> PointCloud:
