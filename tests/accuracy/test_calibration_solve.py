@@ -15,7 +15,7 @@ from scan_distortion import distortion
 from station.calibration.detect.detections import FLOOR, BallDetection, Observations
 from station.calibration.detect.step_names import BALL
 from station.calibration.solve import solving
-from station.calibration.solve.first_problem import height_words
+from station.calibration.solve.first_problem import first_problem, height_words
 from station.calibration.solve.solution import Solution
 from station.core.errors import CalibrationError
 from station.core.geometry import invert, se3_exp, transform
@@ -342,6 +342,18 @@ def test_two_heights_that_were_exchanged_are_told_as_such(
     assert height_words(seen, cameras, radius_m=0.1, reference=REFERENCE) is None
     early = replace(exchanged, balls=exchanged.balls[:20])
     assert height_words(early, cameras, radius_m=0.1, reference=REFERENCE) is None
+
+
+def test_a_height_is_not_judged_by_a_ball_that_hands_cover(
+    procedure: VirtualProcedure, seen: Observations
+) -> None:
+    """The step ended with a traceback: nothing was left of the ball's path."""
+    covered = [replace(ball, radius_sigma_m=0.01) for ball in seen.balls]
+    cameras = synthetic.factory(procedure.booth.rig)
+    seen = replace(seen, balls=covered)
+    assert height_words(seen, cameras, radius_m=0.1, reference=REFERENCE) is None
+    with pytest.raises(CalibrationError, match="no camera saw the whole ball"):
+        first_problem(seen, cameras, 0.1, REFERENCE)
 
 
 class _MovedHook(VirtualProcedure):

@@ -88,6 +88,11 @@ def _problem(
         )
         for name, camera in cameras.items()
     }
+    if not any(len(own.times_s) for own in waved.values()):
+        raise CalibrationError(
+            "no camera saw the whole ball where another one saw it: hold it with few fingers, and "
+            "wave it where several cameras see it"
+        )
     resting: dict[str, list[Sightings]] = {}
     places = {MARK: observations.mark, FRONT: observations.front, **observations.around}
     for place, balls in places.items():
