@@ -57,6 +57,30 @@ def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
     console.audit.close()
 
 
+def test_a_refused_check_may_be_asked_for_again(tmp_path: Path) -> None:
+    """The same key was answered as if the check had begun, and none ever did."""
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    console = Console(load_config(path), path, logging.getLogger())
+    headers = {"Idempotency-Key": "morning"}
+
+    async def answers() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(create_app(console))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            begun = await client.post(f"{API}/calibration", json={"step": "floor"})
+            refused = await client.post(f"{API}/booth/check", headers=headers)
+            while (await client.get(f"{API}/task")).json()["running"]:
+                await asyncio.sleep(0.1)
+            return [begun, refused, await client.post(f"{API}/booth/check", headers=headers)]
+
+    begun, refused, again = asyncio.run(answers())
+    console.tasks.close()
+    console.vault.close()
+    console.audit.close()
+    assert [begun.status_code, refused.status_code, again.status_code] == [202, 409, 202]
+    assert again.json()["kind"] == "check"
+
+
 @contextmanager
 def _nothing_written() -> Iterator[None]:
     """No file grows, as on a full disk."""

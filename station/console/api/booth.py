@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from fastapi import APIRouter, Request, Response
@@ -21,6 +22,7 @@ from station.console.api.console import (
     Reader,
     Scanner,
     caller_of,
+    key_of,
     once,
 )
 from station.console.api.models import (
@@ -171,8 +173,7 @@ def stop(console: Booth, caller: Scanner) -> Streaming:  # noqa: ARG001
 def check(console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Task:
     """Compare the empty booth with its calibration: starts the check, whose progress is at
     `/task`."""
-    if _first(console, caller, key, "check"):
-        console.tasks.check()
+    _begin_once(console, caller, key, "check", console.tasks.check)
     return Task(**console.tasks.state())
 
 
@@ -208,16 +209,29 @@ def unfinished(console: Booth, caller: Reader) -> Unfinished:  # noqa: ARG001
 @router.post("/calibration", status_code=202, responses=responses(409), tags=["calibration"])
 def calibrate(body: NewStep, console: Booth, caller: Manager, key: IdempotencyKey = None) -> Task:
     """Start a step of the calibration, or all remaining steps."""
-    if _first(console, caller, key, body.model_dump_json()):
+
+    def begin() -> None:
         console.audit.note(caller.name, caller.address, f"calibrate {body.step}")
         console.tasks.calibrate(body.step, body.new)
+
+    _begin_once(console, caller, key, body.model_dump_json(), begin)
     return Task(**console.tasks.state())
 
 
-def _first(console: Console, caller: Caller, key: str | None, request: str) -> bool:
-    """Whether an idempotency key is new for this request."""
+def _begin_once(
+    console: Console, caller: Caller, key: str | None, request: str, begin: Callable[[], object]
+) -> None:
+    """Begin a task, unless an idempotency key says that this request has begun it before."""
     mark = f"{time.time_ns()}"
-    return once(console, caller, key, request, mark) == mark
+    if once(console, caller, key, request, mark) != mark:
+        return
+    try:
+        begin()
+    except (BoothError, OSError):
+        # Nothing was begun: the same request may be sent again when the reason is gone.
+        if key is not None:
+            console.vault.forget(key_of(caller.name, key))
+        raise
 
 
 @router.get("/calibrations", responses=responses(409), tags=["calibration"])
