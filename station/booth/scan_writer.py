@@ -142,9 +142,12 @@ class ScanWriter:
     def _begin(self, order: Order) -> None:
         spool = self._spool
         note = spool.notes.read(order.scan_id)
-        if (note is not None and note.stage != "armed") or spool.where(order.scan_id):
+        accepted = spool.where(order.scan_id) is not None
+        if accepted or (note is not None and note.stage != "armed"):
             # A repeated order: its outcome stands.
-            self._events.put(Ended(order.scan_id, True, ""))
+            refused = not accepted and note is not None and note.stage == "failed"
+            reason = note.reason if refused and note is not None else ""
+            self._events.put(Ended(order.scan_id, not refused, reason))
             return
         spool.check_space(self._config.spool.min_free_mb)
         rig = booth_rig(self._config)

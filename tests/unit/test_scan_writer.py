@@ -51,6 +51,23 @@ def test_frames_of_a_finished_scan_leave_the_memory(one_camera: BoothConfig) -> 
         writer.close()
 
 
+def test_a_repeated_order_of_a_refused_scan_is_not_told_as_accepted(
+    one_camera: BoothConfig,
+) -> None:
+    """The page of an accepted scan, /person, says that the person may leave."""
+    writer = ScanWriter(
+        one_camera, DriftWatch(CalibrationStore.of(one_camera)), logging.getLogger()
+    )
+    try:
+        order = Order(ScanId("a"), "", 1e9)
+        writer.refuse(order, "the booth is empty")
+        assert _events(writer) == [Ended(ScanId("a"), False, "the booth is empty")]
+        writer.begin(order)
+        assert _events(writer) == [Ended(ScanId("a"), False, "the booth is empty")]
+    finally:
+        writer.close()
+
+
 class _LongCheck(DriftWatch):
     """A check for moved cameras that lasts until it is told to end."""
 
