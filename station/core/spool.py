@@ -188,7 +188,7 @@ class Spool(ScanFolders):
             claim.fail(note.reason)
         elif note.tries > retries:
             claim.fail(f"{note.tries} reconstructions failed; the last one: {note.reason}")
-        elif note.deaths >= MAX_DEATHS:
+        elif note.deaths >= MAX_DEATHS and claim.scan_id not in self.released:
             claim.fail(f"the station ended {note.deaths + 1} times while it worked on this scan")
         else:
             if claim.scan_id not in self.released:

@@ -102,6 +102,22 @@ def test_a_scan_that_ends_every_worker_is_given_up(tmp_path: Path) -> None:
     assert "the station ended" in failure_reason(spool.path("failed", "a"))
 
 
+def test_a_disk_that_refuses_is_no_end_of_the_station(tmp_path: Path) -> None:
+    """A scan that the station had ended on ten times was given up for one of these."""
+    spool = Spool(tmp_path)
+    _submit(spool, "a")
+    spool.notes.write(ScanNote(ScanId("a"), "accepted", deaths=MAX_DEATHS), durable=False)
+    claim = spool.claim()
+    assert claim is not None
+    claim.release()
+    assert spool.recover(retries=2) == ["a"]
+    claim = spool.claim()
+    assert claim is not None
+    claim.close()
+    assert spool.recover(retries=2) == []
+    assert spool.where("a") == "failed"
+
+
 def test_a_scan_whose_jobs_crash_is_given_up_with_the_last_reason(tmp_path: Path) -> None:
     spool = Spool(tmp_path)
     _submit(spool, "a")
