@@ -90,7 +90,7 @@ def tracks() -> dict[str, Detections]:
 
 def pairs(agreeing: float) -> dict[tuple[str, str], Pair]:
     times = np.arange(100.0)
-    return {(NAMES[0], NAMES[1]): Pair(np.eye(4), times, times < 100 * agreeing, 0.0 * times)}
+    return {(NAMES[0], NAMES[1]): Pair(np.eye(4), times, times < 100 * agreeing)}
 
 
 def predicted(height_m: float, girth_m: float) -> PredictedError:

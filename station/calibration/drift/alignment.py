@@ -20,14 +20,12 @@ from station.calibration.drift.motion import LEVER_M, MIN_SHARE, CameraMove
 from station.calibration.drift.reference import COMMON, LOCAL, DriftReference
 from station.core.depth.images import Image
 from station.core.geometry import invert, se3_exp, transform
+from station.core.kinect_v1 import FROZEN_SHARE
 from station.core.lens import project
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_FROZEN = 0.5
-"""Share of the noise's variance that stays from frame to frame of a still scene, as the
-calibration assumes; a camera that moves sees it change."""
 _CORRELATION = 2.5
 """Samples after a blur of 3.4 px (the sensor's window and ours) are nearly independent; the
 variances of their sums are this much larger."""
@@ -129,8 +127,10 @@ class _Samples:
         at = np.flatnonzero(same)
         block = reference.block.ravel()[at]
         at, block = at[np.argsort(block, kind="stable")], np.sort(block)
-        flicker = (1.0 - _FROZEN) * (1.0 / frames + 1.0 / reference.frames)
-        variance = reference.noise.ravel()[at] ** 2 * (2.0 * _FROZEN + flicker) + _FLOOR_PER_M**2
+        # The frozen share does not average out, and a camera that moves sees it change.
+        share = 2.0 * FROZEN_SHARE
+        share += (1.0 - FROZEN_SHARE) * (1.0 / frames + 1.0 / reference.frames)
+        variance = reference.noise.ravel()[at] ** 2 * share + _FLOOR_PER_M**2
         sigma = np.sqrt(_CORRELATION * variance)
         columns = (reference.jacobian, reference.common, reference.local)
         design = np.concatenate([c.reshape(-1, c.shape[-1])[at] for c in columns], axis=1)

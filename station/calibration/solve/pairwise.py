@@ -73,8 +73,6 @@ class Pair:
     """(n,) of the matches: a's detections."""
     agree: Mask
     """(n,)."""
-    error_m: Array
-    """(n,) distance of each match."""
 
 
 def match(a: Track, b: Track, shift_s: float = 0.0) -> tuple[Array, Array, Array]:
@@ -106,8 +104,7 @@ def estimate_pair(a: Track, b: Track, seed: int = 0) -> Pair | None:
         if agree.sum() < 3:
             return None
         best = rigid_fit(in_a[agree], in_b[agree])
-    error = _distance(best, in_a, in_b)
-    return Pair(best, times, error < GATE_M, error)
+    return Pair(best, times, _distance(best, in_a, in_b) < GATE_M)
 
 
 def estimate_pairs(tracks: Mapping[str, Track]) -> dict[tuple[str, str], Pair]:

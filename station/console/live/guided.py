@@ -19,7 +19,6 @@ from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError, CalibrationError
 
-STEPS = ("all", "floor", "ball", "mark", "front", "around", "stand", "depth", "solve")
 _PROGRESS_S = 0.2
 
 
