@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import os
@@ -27,6 +28,7 @@ from station.booth.deletion import purge_scans
 from station.booth.health import booth_health
 from station.booth.retention import Deleted
 from station.console.live import watch as watch_module
+from station.console.live.cameras import Pictures
 from station.console.live.control import NotRunningError, RefusedError
 from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
@@ -36,7 +38,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.scans import CANCELLED, ScanId, ScanNote, scan_id_of
 from station.core.spool import Spool
-from station.messaging.messages import CameraHealth
+from station.messaging.messages import CameraHealth, FrameHeader
 from station.messaging.transport import publisher
 from station.simulation.scene import default_rig
 
@@ -348,3 +350,33 @@ def _refuses(tasks: Tasks) -> bool:
     except RefusedError as error:
         return "nothing is waiting" in str(error)
     return False
+
+
+def test_a_bad_frame_costs_a_viewer_no_more_than_that_picture(
+    one_camera: BoothConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whoever had asked for it waited for a minute, and was disconnected."""
+    header = FrameHeader("front-lower", "V1", 64, 48, 1e-3, 7, 6e7, 5.0, 5.0, 1, 0)
+    pictures = Pictures(one_camera, logging.getLogger())
+    pictures.start()
+
+    async def picture(camera: zmq.Socket[bytes]) -> bytes:
+        asked, told = asyncio.create_task(pictures.next()), False
+        deadline_s = time.monotonic() + 30.0
+        while not (told and asked.done()) and time.monotonic() < deadline_s:
+            told = "depth pictures" in caplog.text
+            if asked.done() and not told:
+                asked = asyncio.create_task(pictures.next())
+            depth = np.full(48 * 64 if told else 7, 1500, np.uint16)
+            camera.send_multipart([b"depth/front-lower", header.pack(), depth.tobytes()])
+            await asyncio.sleep(0.02)
+        return await asyncio.wait_for(asked, 1.0)
+
+    with zmq.Context() as context:
+        camera = publisher(context, one_camera.runtime.folder, "camera-front-lower", "depth")
+        try:
+            assert b"front-lower" in asyncio.run(picture(camera))
+        finally:
+            camera.close()
+            pictures.close()
+    assert "depth pictures" in caplog.text

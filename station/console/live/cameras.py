@@ -98,7 +98,13 @@ class Pictures:
                     continue
                 asked_s = now_s
                 fresh = {n: p for n, p in newest.items() if now_s - came_s[n] < _FORGET_S}
-                _give(waiting, self._packed(fresh))
+                try:
+                    packed = self._packed(fresh)
+                except BaseException:
+                    with self._lock:
+                        self._waiting[:0] = waiting  # for the pictures after the fault
+                    raise
+                _give(waiting, packed)
         finally:
             frames.close()
             with self._lock:
