@@ -4,6 +4,7 @@ import ast
 import re
 import shlex
 import subprocess
+import sys
 import textwrap
 import tomllib
 from collections.abc import Iterator
@@ -236,6 +237,18 @@ def test_examples_can_be_read_and_import_what_exists(document: Path) -> None:
                 names = [f"{node.module}.{alias.name}" for alias in node.names]
                 ours = [name for name in names if name.startswith(("station.", "workers."))]
                 assert [name for name in ours if not _resolves(name)] == []
+
+
+@documents
+@pytest.mark.parametrize("rule", [("check", "--ignore=I001"), ("format", "--check")])
+def test_files_that_a_recipe_writes_pass_the_gate(document: Path, rule: tuple[str, ...]) -> None:
+    """Whoever copied one was refused by `make check`. I001 goes by which modules exist."""
+    for path, content in _written(document).items():
+        command = [sys.executable, "-m", "ruff", *rule, "--stdin-filename", path, "-"]
+        done = subprocess.run(
+            command, cwd=ROOT, input=content, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 ARCHITECTURE = ROOT / "docs" / "architecture.md"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from importlib import resources
 from pathlib import Path
@@ -20,6 +21,7 @@ from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import reconstruct_bundle, reconstruct_cloud
 from workers.scape.model.body_model import load_model
 
+README = Path(__file__).parents[2] / "README.md"
 SHA = "0" * 64
 SCHEMAS = {
     "result": "workers.export",
@@ -204,7 +206,9 @@ def test_every_file_is_named_with_its_hash(result: Path) -> None:
     document = _read(result / "result.json")
     there = {path.name for path in result.iterdir()} - {"result.json"}
     assert set(document["files"]) == there
-    assert {"avatar.glb", "mesh.glb", "preview.png"} <= there
+    table = README.read_text().partition("\nA **result** holds:\n")[2].partition("\n\nWorld")[0]
+    named = [cell for row in table.split("\n") for cell in row.split("|")[1:2]]
+    assert set(re.findall(r"`([^`]+)`", "".join(named))) == {*there, "result.json"}
     for name, digest in document["files"].items():
         assert hashlib.sha256((result / name).read_bytes()).hexdigest() == digest
 
