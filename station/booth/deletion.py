@@ -161,6 +161,8 @@ def purge(
     """
     if sum([bool(scan_id), label is not None, old]) != 1:
         raise click.UsageError("give a scan id, --label or --old")
+    if label is not None and not plain_label(label):
+        raise click.UsageError("the label is blank, as that of every scan without one; give ids")
     say: Callable[[str], None] = set_up_logs("purge").info if logged else click.echo
     config = load_config(find_config(config_path))
     spool = Spool(config.spool.folder)

@@ -1,13 +1,20 @@
-"""Deletion of scans on the command line, and the words on what it leaves."""
+"""Deletion of scans by commands and the API, and the words on what it leaves."""
 
+import asyncio
 import errno
+import logging
 from pathlib import Path
 
+import httpx
 import pytest
 from click.testing import CliRunner
+from live_console import API
 
 from station.archive.index import ScanIndex
 from station.booth.deletion import labelled, purge
+from station.console.api.console import Console
+from station.console.app import create_app
+from station.core.config_file import load_config
 from station.core.files import write_json
 from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
@@ -41,6 +48,31 @@ def test_copies_that_were_handed_over_are_told_by_purge(spool: Spool, option: li
     assert (ledger.receivers(scan_id), ledger.waiting()) == ([], [])
     [other, *_] = [scan.scan_id for scan in ScanIndex(spool).find()]
     assert "copies handed" not in CliRunner().invoke(purge, [other, *option]).output
+
+
+@pytest.mark.parametrize("label", ["", " "])
+def test_a_blank_label_deletes_nothing(spool: Spool, option: list[str], label: str) -> None:
+    """It deleted every scan without a label: a script's variable was empty."""
+    spool.notes.write(ScanNote(ScanId("nameless"), "failed"), durable=False)
+    assert CliRunner().invoke(purge, ["--label", label, *option]).exit_code == 2
+    assert labelled(spool, label) == ["nameless"]
+
+
+def test_a_blank_label_deletes_nothing_by_the_api(tmp_path: Path) -> None:
+    path = tmp_path / "booth.toml"
+    path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
+    console = Console(load_config(path), path, logging.getLogger())
+    console.spool.notes.write(ScanNote(ScanId("a"), "failed"), durable=False)
+
+    async def answer() -> httpx.Response:
+        transport = httpx.ASGITransport(create_app(console))
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+            return await client.delete(f"{API}/scans", params={"label": " "})
+
+    assert asyncio.run(answer()).status_code == 404
+    assert console.spool.notes.ids() == ["a"]
+    console.vault.close()
+    console.audit.close()
 
 
 def test_scans_of_a_label_are_deleted_all_or_none(spool: Spool, option: list[str]) -> None:

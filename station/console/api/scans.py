@@ -28,7 +28,7 @@ from station.console.api.console import (
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, RefusedError, command
-from station.core.scans import boot_id, new_scan_id, scan_id_of
+from station.core.scans import boot_id, new_scan_id, plain_label, scan_id_of
 from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])
@@ -163,8 +163,9 @@ def delete_label(
     console: Booth,
     caller: Manager,
 ) -> Removed:
-    """Delete all scans with exactly this label."""
-    found = labelled(console.spool, label)
+    """Delete all scans with exactly this label, which is not blank."""
+    # As lists show it, a blank one is that of every scan without a label.
+    found = labelled(console.spool, label) if plain_label(label) else []
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
     return _delete(console, caller, found)
