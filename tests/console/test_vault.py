@@ -57,6 +57,23 @@ def test_a_full_disk_is_told_by_a_problem_document(tmp_path: Path) -> None:
     console.audit.close()
 
 
+class _Hurried(Vault):
+    """A vault whose keys another request forgets at once: it was refused."""
+
+    def _run(self, query: str, *values: object) -> list[tuple[object, ...]]:
+        found = super()._run(query, *values)
+        if "INTO keys" in query:
+            super()._run("DELETE FROM keys")
+        return found
+
+
+def test_a_key_that_another_request_forgets_meanwhile_is_new(tmp_path: Path) -> None:
+    """It was a server error."""
+    vault = _Hurried(tmp_path)
+    assert vault.remember("key", "request", "answer") == ("request", "answer")
+    vault.close()
+
+
 def test_a_refused_check_may_be_asked_for_again(tmp_path: Path) -> None:
     """The same key was answered as if the check had begun, and none ever did."""
     path = tmp_path / "booth.toml"

@@ -192,8 +192,12 @@ class Vault:
         """
         now = time.time()
         self._run("DELETE FROM keys WHERE made < ?", now - _KEYS_KEPT_S)
-        self._run("INSERT OR IGNORE INTO keys VALUES (?, ?, ?, ?)", key, request, answer, now)
-        found = self._run("SELECT request, answer FROM keys WHERE key = ?", key)[0]
+        # In one statement: another request with this key may be refused, and forget it.
+        [found] = self._run(
+            "INSERT INTO keys VALUES (?, ?, ?, ?) ON CONFLICT (key) DO UPDATE SET key = key "
+            "RETURNING request, answer",
+            key, request, answer, now,
+        )  # fmt: skip
         return str(found[0]), str(found[1])
 
     def forget(self, key: str) -> None:
