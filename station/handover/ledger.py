@@ -136,6 +136,7 @@ class Ledger:
                 document = json.loads(path.read_bytes())
                 entry = Waiting(path.parent.parent.name, path.stem, int(document["tries"]),
                                 float(document["next_s"]), str(document["error"]))  # fmt: skip
+                entry.document()  # its moment may be beyond the calendar
             except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
                 entry = Waiting(path.parent.parent.name, path.stem)
             found.append(entry)

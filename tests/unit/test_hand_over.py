@@ -243,15 +243,16 @@ def test_a_result_that_leaves_before_it_is_handed_over_is_told(
 @pytest.mark.parametrize(
     "content",
     ["[" * 100_000, '{"tries": Infinity, "next_s": 0, "error": ""}',
-     '{"tries": -100, "next_s": NaN, "error": ""}'],
+     '{"tries": -100, "next_s": NaN, "error": ""}', '{"tries": 1, "next_s": 1e300, "error": ""}'],
 )  # fmt: skip
 def test_odd_entries_are_tried_at_once(tmp_path: Path, content: str) -> None:
-    """`station deliver` ended with them at every start."""
+    """`station deliver` ended with them at every start, and the API told nothing of the booth."""
     ledger = Ledger(tmp_path)
     ledger.keep(Waiting("share", _IDS[0]))
     (tmp_path / "handover/share/waiting" / f"{_IDS[0]}.json").write_text(content)
     [entry] = ledger.waiting()
     assert entry.due(1e9)
+    assert entry.document()["next_try"] == ""
     assert entry.failed("again", 1e9).next_s == 1e9 + PAUSES_S[0]
 
 
