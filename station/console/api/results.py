@@ -39,7 +39,7 @@ def _open(console: Console, caller: Caller, scan_id: str, what: str) -> tuple[Sc
     return record, folder
 
 
-@router.get("/files", responses=responses(404))
+@router.get("/files", responses=responses(404, 409))
 def files(scan_id: ScanId, console: Booth, caller: Reader) -> list[File]:
     """The result's files."""
     _, folder = _open(console, caller, scan_id, "list of files")
@@ -66,7 +66,7 @@ _ANY_FILE: dict[str, Any] = {
     "/files/{name}",
     response_class=FileResponse,
     responses={
-        **responses(400, 404, 416),
+        **responses(400, 404, 409, 416),
         200: {"description": "The file", "content": _ANY_FILE},
         206: {"description": "A range of it", "content": _ANY_FILE},
         304: {"description": "The file that If-None-Match names"},
@@ -93,7 +93,7 @@ def file(
     return FileResponse(path, media_type=media, headers={"etag": tag, "cache-control": "no-cache"})
 
 
-@router.get("/quality", responses=responses(404))
+@router.get("/quality", responses=responses(404, 409))
 def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
     """Coverage of each part of the body, and whether the verdict doubts it."""
     record, folder = _open(console, caller, scan_id, "quality")
