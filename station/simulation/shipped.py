@@ -4,6 +4,7 @@ What four perfect sensors would see was rendered once (`render`); the errors of 
 anew wherever recordings are made of it, so that the views take little space and no open3d.
 
 Usage: python -m station.simulation.shipped FOLDER
+       python -m station.simulation.shipped --render    renders the views that the package carries
 """
 
 from __future__ import annotations
@@ -85,5 +86,14 @@ def render() -> tuple[Rig, dict[str, TrueView]]:
     return booth.rig, {c.name: scene.view(c, c.world_from_camera) for c in cameras}
 
 
+def main() -> None:
+    if sys.argv[1] == "--render":
+        rig, views = render()
+        rig.save(CALIBRATION)
+        save_views(VIEWS, views)
+    else:
+        record(Path(sys.argv[1]))
+
+
 if __name__ == "__main__":
-    record(Path(sys.argv[1]))
+    main()

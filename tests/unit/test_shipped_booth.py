@@ -11,7 +11,14 @@ import numpy as np
 from station.core.kinect_v1 import depth_m_of_raw
 from station.core.rig import Rig
 from station.sensors.recording import check_recording, read_raw
-from station.simulation.shipped import CALIBRATION, DEPTH_STEP_M, VIEWS, load_views, render
+from station.simulation.shipped import (
+    CALIBRATION,
+    DEPTH_STEP_M,
+    VIEWS,
+    load_views,
+    render,
+    save_views,
+)
 
 _WITHOUT_OPEN3D = """
 import sys
@@ -22,8 +29,10 @@ record(Path(sys.argv[1]))
 """
 
 
-def test_the_views_are_those_that_are_rendered_today() -> None:
+def test_the_views_are_those_that_are_rendered_today(tmp_path: Path) -> None:
     rig, rendered = render()
+    save_views(tmp_path / "views.npz", rendered)
+    again = load_views(tmp_path / "views.npz")
     assert Rig.load(CALIBRATION).cameras.keys() == rig.cameras.keys()
     kept = load_views(VIEWS)
     assert kept.keys() == rendered.keys()
@@ -34,6 +43,9 @@ def test_the_views_are_those_that_are_rendered_today() -> None:
         both = seen & kept[name].lit
         off_m = np.abs(kept[name].depth_m - view.depth_m)[both]
         assert np.quantile(off_m, 0.999) <= DEPTH_STEP_M
+        np.testing.assert_array_equal(again[name].lit, seen)
+        off_m = np.abs(again[name].depth_m - view.depth_m)[seen]
+        assert off_m.max() < 0.51 * DEPTH_STEP_M
         same = Rig.load(CALIBRATION).cameras[name].world_from_camera
         np.testing.assert_allclose(same, rig.cameras[name].world_from_camera, atol=1e-12)
 

@@ -42,7 +42,7 @@ from station.console.api.models import (
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import command
 from station.core.errors import BoothError, CalibrationError
-from station.core.geometry import invert, so3_log
+from station.core.geometry import invert, twist_between
 from station.core.rig import Rig
 from station.messaging.messages import Request as ControlRequest
 
@@ -270,12 +270,12 @@ def compare(first: str, second: str, console: Booth, caller: Reader) -> list[Cam
             @ rig.cameras[name].world_from_camera
             for rig in (before, after)
         )
-        move = invert(here) @ there
+        xi = twist_between(here, there)
         shifts.append(
             CameraShift(
                 camera=name,
-                shift_mm=round(1e3 * float(np.linalg.norm(move[:3, 3])), 2),
-                turn_deg=round(float(np.degrees(np.linalg.norm(so3_log(move[:3, :3])))), 3),
+                shift_mm=round(1e3 * float(np.linalg.norm(xi[3:])), 2),
+                turn_deg=round(float(np.degrees(np.linalg.norm(xi[:3]))), 3),
             )
         )
     return sorted(shifts, key=lambda shift: shift.camera)
