@@ -92,6 +92,21 @@ def test_a_scan_that_waits_for_the_compiler_says_so(console: LiveConsole) -> Non
         expect(compiled).to_have_count(0)
 
 
+def test_a_person_whose_scan_is_cancelled_is_not_asked_for_another(console: LiveConsole) -> None:
+    """The screen in the booth said to stand on the mark again."""
+    with browser() as started, console.client("scan") as client:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        page.goto(f"{console.url}/person")
+        screen = page.locator("body")
+        expect(screen).to_have_attribute("data-screen", "guide", timeout=LONG_MS)
+        scan = client.post("/scans", json={"label": "gone", "countdown_s": 20}).json()
+        expect(screen).to_have_attribute("data-screen", "countdown", timeout=LONG_MS)
+        client.post(f"/scans/{scan['scan_id']}/cancel").raise_for_status()
+        expect(screen).not_to_have_attribute("data-screen", "countdown", timeout=LONG_MS)
+        expect(screen).to_have_attribute("data-screen", "guide")
+
+
 def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:
     with browser() as started:
         page = tablet(started).new_page()

@@ -3,7 +3,7 @@
 import { get } from './api.js';
 import { h, s } from './dom.js';
 import { connect, listen } from './events.js';
-import { loadWords, t } from './i18n.js';
+import { loadWords, outcome, t } from './i18n.js';
 
 const THANKS_MS = 12000;
 const main = document.getElementById('person');
@@ -69,6 +69,7 @@ listen((kind, data) => {
     else if (data.state === 'capturing') hold();
     else if (data.state === 'writing') taken();
     else if (data.state === 'accepted') free();
+    else if (outcome({ state: data.state, reasons: [data.reason] }) === 'cancelled') guide();
     else if (data.state === 'failed') again();
   } else if (kind === 'calibration' && data.running && data.countdown_s) countdown(data.countdown_s);
   else if (kind === 'calibration' && !data.running) guide();
