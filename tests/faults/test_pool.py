@@ -25,7 +25,7 @@ from station.core.scans import REASON, ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
 from workers.reconstruct import pool
-from workers.reconstruct.job_handle import WARM_UP_S
+from workers.reconstruct.job_handle import WARM_UP_S, Outcome
 from workers.reconstruct.pool import Worker
 
 _DAY_S = 86_400.0
@@ -114,6 +114,26 @@ def test_nothing_of_an_interrupted_job_stays(spool: Spool, tmp_path: Path) -> No
         worker._do(claim, process)
     assert not list((spool.folder / "tmp").iterdir())
     claim.close()
+
+
+def test_a_scan_that_is_done_again_counts_once_for_the_cameras(
+    spool: Spool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that refused the delivery made one person two."""
+    worker = _idle_worker(spool, tmp_path)
+    (temporary := spool.temporary("a")).mkdir()
+    spool.submit(temporary, "a")
+    claim = spool.claim()
+    assert claim is not None
+    done = Outcome(status="ok", evidence={"format": "booth-camera-evidence"})
+    process: Any = SimpleNamespace(send=lambda *_: None, outcome=lambda *_: done)
+    with monkeypatch.context() as full:
+        full.setattr(claim, "deliver", _refuse)
+        with pytest.raises(OSError, match="Cannot allocate"):
+            worker._do(claim, process)
+    worker._do(claim, process)
+    assert spool.where("a") == "outbox"
+    assert len(list((spool.folder / "cameras").iterdir())) == 1
 
 
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:

@@ -129,10 +129,11 @@ class Worker:
         process.send(claim.bundle, out, self._config)
         outcome = process.outcome(self._config.workers.timeout_s, self._stop, self._warm_another)
         if outcome.status:
-            if outcome.evidence is not None:
-                keep_evidence(outcome.evidence, self._spool.folder / CAMERAS)
             claim.deliver(out, outcome.status, outcome.reason)
             self.delivered += 1
+            # Not before: a scan that is done again would count as two people's.
+            if outcome.evidence is not None:
+                keep_evidence(outcome.evidence, self._spool.folder / CAMERAS)
             self._log.info("scan %s delivered", claim.scan_id, extra={"scan": claim.scan_id})
             return
         shutil.rmtree(out, ignore_errors=True)
@@ -180,7 +181,7 @@ def keep_evidence(document: Mapping[str, Any], folder: Path) -> None:
     """Put what a scan says of its cameras to that of other scans, under a name that tells neither
     the scan nor its time; the oldest beyond _KEPT go.
 
-    Losing it loses nothing else: errors of the disk are those of the delivery that follows.
+    Losing it loses nothing else, also where the disk refuses.
     """
     try:
         write_json(private_folder(folder) / f"{uuid.uuid4().hex}.json", document)

@@ -41,7 +41,7 @@ def _rig() -> Rig:
 
 
 def scan(folder: Path, write_result: Callable[[Path], None]) -> None:
-    """A scan's life: order, bundle, claim, evidence about the cameras, result, delivery."""
+    """A scan's life: order, bundle, claim, result, delivery, evidence about the cameras."""
     spool = Spool(folder / "spool")
     if spool.notes.read(SCAN) is None and spool.where(SCAN) is None:
         spool.notes.write(ScanNote(SCAN, "armed"), durable=False)
@@ -53,8 +53,8 @@ def scan(folder: Path, write_result: Callable[[Path], None]) -> None:
         result.mkdir()
         try:
             write_result(result)
-            keep_evidence({"format": "booth-camera-evidence"}, spool.folder / CAMERAS)
             claim.deliver(result, "ok")
+            keep_evidence({"format": "booth-camera-evidence"}, spool.folder / CAMERAS)
         except OSError:
             claim.release()
             raise
