@@ -146,6 +146,14 @@ def test_a_file_that_cannot_be_written_leaves_no_result(
     assert not (tmp_path / "result.json").exists()
 
 
+def test_the_steps_of_all_stages_are_counted(model: BodyModel, bundle: Path) -> None:
+    """result.json told those of the last stage."""
+    told: list[str] = []
+    scan = preprocess(read_bundle(bundle))
+    fit = fit_body(model, scan, observer=lambda stage, _: told.append(stage))
+    assert fit.iterations == told.count("correspondences")
+
+
 def test_one_thread_of_blas_filters_too(
     model: BodyModel, bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,15 +75,6 @@ class Rows:
         total = [np.bincount(sample, strength * direction[:, i], count) for i in range(3)]
         return weight, np.stack(total, axis=1)
 
-    def along(self, normals: Array) -> tuple[Array, Array]:
-        """Sums for displacements along normals (P, 3): information (P,), weighted residual (P,)."""
-        count = len(normals)
-        cosine = np.einsum("ni,ni->n", self.direction, normals[self.place])
-        strength = self.weight * cosine
-        information: Array = np.bincount(self.place, strength * cosine, count).astype(np.float64)
-        total: Array = np.bincount(self.place, strength * self.residual_m, count).astype(np.float64)
-        return information, total
-
 
 @dataclass(frozen=True, slots=True)
 class CameraTerms:

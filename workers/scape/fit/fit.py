@@ -59,6 +59,8 @@ _START_POINTS, _START_SAMPLES = 800, 250
 """Points of the cloud and vertices of the model that starting poses are compared with."""
 _FACING_EVERY = 10
 """Every so many points are used to find the direction that the toes point in."""
+_STEPS = len(COARSE) + len(MIDDLE) + len(FINE)
+"""Steps of the joint fit from one starting pose."""
 _MAX_STARTS = 8
 """Starting poses that are tried at most, 80 ms each: with 5, 3 of 928 sound clouds lost an arm."""
 _RIM_EVERY = 8
@@ -92,6 +94,7 @@ class FitResult:
     coverage: float
     correspondences: int
     iterations: int
+    """Steps from the starting pose that was chosen."""
     camera_shifts_m: dict[str, float]
     """Distance by which each camera's points were moved to agree with the others."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -175,7 +178,7 @@ def fit_overlapping(
         fitted = time.monotonic()
     else:
         joint = _best_start(model, sampling, scan, target, starts, progress, observer)
-        state, used, iterations = joint.state, joint.correspondences, joint.iterations
+        state, used, iterations = joint.state, joint.correspondences, _STEPS
         cameras, reference, evidence = joint.cameras, joint.vertices, joint.evidence
         observer("joint", {"vertices": reference})
         fitted = time.monotonic()

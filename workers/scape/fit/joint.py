@@ -61,7 +61,6 @@ class JointResult:
     """(P, 3), the model's surface."""
     correspondences: int
     """Number of pairs in the last step."""
-    iterations: int
     evidence: CameraEvidence | None
     """None where corrections were not estimated."""
 
@@ -122,7 +121,6 @@ def fit_jointly(
         cameras,
         model.vertices(state),
         len(terms.on_body),
-        len(schedule),
         None if evidence is None else evidence(),
     )
 

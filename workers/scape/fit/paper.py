@@ -82,7 +82,6 @@ def fit_like_the_paper(
         seen=seen,
         residual_m=residual,
         measured=seen,
-        mismatch_m=float(np.sqrt(np.nanmean(residual**2))),
     )
     return surface, state, iteration
 

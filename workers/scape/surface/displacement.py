@@ -104,8 +104,6 @@ class SurfaceFit:
     """(P,): mean signed distance of the vertex's points after the fit; NaN where it has none."""
     measured: NDArray[np.bool_]
     """(P,): vertices of triangles with points on them."""
-    mismatch_m: float
-    """Rms distance of the points from the model's surface before it was displaced."""
     crossing: Future[Pairs] | None = None
     """Pairs (m, 2) of triangles that cross, which are searched for meanwhile."""
 
@@ -309,7 +307,6 @@ def _examined(
         seen=seen,
         residual_m=np.where(after.observed, after.residual_m, np.nan),
         measured=measured,
-        mismatch_m=before.rms_m,
         crossing=crossing,
     )
 
