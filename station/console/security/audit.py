@@ -31,7 +31,7 @@ class AuditLog:
     def __init__(self, folder: Path) -> None:
         private_folder(folder)
         self._handler = _PrivateFiles(
-            folder / FILE, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
+            folder / FILE, maxBytes=_BYTES, backupCount=_FILES - 1, encoding="utf-8"
         )
 
     def note(self, who: str, address: str, what: str, scan_id: str = "") -> None:
