@@ -17,8 +17,9 @@ from station.core.errors import InputError
 from station.core.geometry import so3_exp
 from station.simulation.scene import Mesh, load_mesh
 from station.simulation.sensor import render_bundle
-from workers.cloud.cloud_file import _outwards, read_cloud
+from workers.cloud.cloud_file import read_cloud
 from workers.cloud.observed import PointCloud, Preprocessed
+from workers.cloud.outwards import oriented
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import measure_body
 from workers.reconstruct.job import reconstruct_bundle
@@ -193,7 +194,7 @@ def test_a_cloud_without_normals_and_with_gaps_is_fitted(
     cloud = read_cloud(tmp_path / "bare.ply", "z")
     assert np.mean(np.einsum("ni,ni->n", cloud.normals, seen.normals) > 0.0) > 0.95
     ahead = np.where(seen.normals[:, 1] < 0.0, 1.0, -1.0)[:, None]
-    outwards = _outwards(seen.points, ahead * seen.normals)
+    outwards = oriented(seen.points, ahead * seen.normals)
     assert np.mean(np.einsum("ni,ni->n", outwards, seen.normals) > 0.0) > 0.95
     fit = fit_body(model, Preprocessed(cloud, (), ()))
     truth = np.load(BODIES / "ben.npz")["vertices"] - cloud.origin_m

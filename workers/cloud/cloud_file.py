@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from station.core.errors import InputError
 from workers.cloud.bare import lowest_m, scatter_m
 from workers.cloud.floor import UNITS_M, Z_UP, check_units, standing_on
 from workers.cloud.observed import MIN_POINTS, POSSIBLE_HEIGHTS_M, PointCloud
+from workers.cloud.outwards import outward_normals
 from workers.cloud.pcd import check_pcd
 from workers.cloud.ply import read_points, read_triangles
 
@@ -22,29 +21,8 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 _MAX_POINTS = 250_000
-_NORMAL_NEIGHBOURS = 24
-"""Neighbours that a normal is estimated from."""
-_UNIT = 0.01
-"""Deviation from 1 of a normal's length in a file: formats round to a few digits."""
-_ORIENTED = 25_000
-"""Points whose normals are oriented; the others follow the nearest of them."""
-_DIRECTIONS = 40
-"""Directions, evenly around, from which a cloud is looked at."""
-_PIXEL_M = 0.015
-"""Pixels of these pictures: points are 5 to 8 mm apart."""
-_HIDDEN_M = 0.02
-"""Depth behind the nearest of the pixels around it from which a point is hidden: that of slanted
-skin, and less than a hand is thick."""
 _FLAT_M = 0.005
 """Least standard deviation of a body's points across its thinnest direction."""
-_FOOT_M = 0.12
-"""Height of a foot."""
-_LINKS, _SPREAD_ROUNDS = 8, 150
-"""Neighbours that evidence is shared with, and how often: points are 5 to 8 mm apart, so that it
-comes 10 cm far."""
-_SAME_SKIN = 0.6
-"""Largest sine of the slope from a point to a neighbour on the same skin, and the least cosine of
-their normals."""
 _SIGMA_M = 0.001
 """Standard deviation that is assumed for the points of a file."""
 _UNSEEN_SOLES_M = 0.03
@@ -85,13 +63,9 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
     person = standing_on(np.asarray(cloud.points))
     if person is not None:
         cloud = cloud.select_by_index(np.flatnonzero(person[0]))
-    if not _has_unit_normals(cloud):
-        _estimate_normals(cloud)
-    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    points, normals = np.asarray(cloud.points), outward_normals(cloud)
     tree = cKDTree(points)
     middle = np.median(points, axis=0)
-    if np.einsum("ni,ni->n", points - middle, normals).mean() < 0:
-        normals = -normals
     if person is None:
         low_m = lowest_m(tree)
         middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
@@ -162,87 +136,9 @@ def _read(path: Path) -> o3d.geometry.PointCloud:
     return cloud
 
 
-def _has_unit_normals(cloud: o3d.geometry.PointCloud) -> bool:
-    """Whether every point has a direction: programs that know none write zeros."""
-    lengths = np.linalg.norm(np.asarray(cloud.normals), axis=1)
-    return cloud.has_normals() and bool((np.abs(lengths - 1.0) < _UNIT).all())
-
-
 def _check_solid(points: Array, path: Path) -> None:
     if np.linalg.matrix_rank(points - points.mean(axis=0), _FLAT_M * np.sqrt(len(points))) < 3:
         raise InputError(f"{path} is flat; a body has a front and a back")
-
-
-def _estimate_normals(cloud: o3d.geometry.PointCloud) -> None:
-    """Give a cloud normals that point out of the body or into it."""
-    points = np.asarray(cloud.points)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
-    cloud.normals = o3d.utility.Vector3dVector(_outwards(points, np.asarray(cloud.normals)))
-
-
-def _outwards(points: Array, normals: Array) -> Array:
-    """Normals (n, 3) of a body's points (n, 3), each oriented to where the skin around it is seen
-    from.
-    """
-    chosen = slice(None, None, max(1, len(points) // _ORIENTED))
-    places, directions = points[chosen], normals[chosen]
-    tree = cKDTree(places)
-    evidence = _spread(tree, directions, _evidence(points, places, directions))
-    mine = np.where(evidence < 0.0, -1.0, 1.0)[:, None] * directions
-    mine = mine[tree.query(points, workers=-1)[1]]
-    agrees = np.einsum("ni,ni->n", mine, normals) >= 0.0
-    return np.where(agrees[:, None], normals, -normals)
-
-
-def _spread(tree: cKDTree, directions: Array, evidence: Array) -> Array:
-    """Evidence (n,) of a tree's points, spread along the skin: neighbours whose directions are
-    alike share it, and where they are opposite it changes its sign.
-    """
-    neighbours = tree.query(tree.data, _LINKS + 1, workers=-1)[1][:, 1:]
-    offsets = tree.data[neighbours] - tree.data[:, None]
-    across = np.abs(np.einsum("ni,nki->nk", directions, offsets))
-    cosine = np.einsum("ni,nki->nk", directions, directions[neighbours])
-    # Skin that touches other skin lies along the normal from it.
-    one_skin = across < _SAME_SKIN * np.linalg.norm(offsets, axis=2)
-    link = np.where(one_skin & (np.abs(cosine) > _SAME_SKIN), cosine, 0.0)
-    tail = np.repeat(np.arange(tree.n), _LINKS)
-    graph = csr_matrix((link.ravel() / _LINKS, (tail, neighbours.ravel())), shape=(tree.n, tree.n))
-    found = evidence
-    for _ in range(_SPREAD_ROUNDS):
-        found = evidence + graph @ found
-    return np.asarray(found)
-
-
-def _evidence(points: Array, places: Array, directions: Array) -> Array:
-    """Evidence (n,) that directions (n, 3) at places (n, 3) of a cloud point out of the body;
-    negative where they point into it.
-
-    Whoever sees a place looks at the skin's outside. A foot stands on a floor, which hides its
-    inside from below.
-    """
-    low_m = float(points[:, 2].min())
-    floor = points[points[:, 2] < low_m + _FOOT_M] * (1.0, 1.0, 0.0) + (0.0, 0.0, low_m)
-    seen = np.concatenate([points, floor])
-    found = np.zeros(len(places))
-    for towards in _evenly_around(_DIRECTIONS):
-        across = np.linalg.svd(towards[None])[2][1:].T
-        corner = (seen @ across).min(axis=0) - _PIXEL_M
-        pixel = ((seen @ across - corner) / _PIXEL_M).astype(np.int64)
-        nearest = np.full(pixel.max(axis=0) + 2, -np.inf)
-        np.maximum.at(nearest, tuple(pixel.T), seen @ towards)
-        nearest = ndimage.maximum_filter(nearest, 3)
-        mine = ((places @ across - corner) / _PIXEL_M).astype(np.int64)
-        visible = places @ towards > nearest[tuple(mine.T)] - _HIDDEN_M
-        found += visible * (directions @ towards)
-    return found
-
-
-def _evenly_around(count: int) -> Array:
-    """Unit vectors (count, 3) on a spiral of equal steps in height (Fibonacci's lattice)."""
-    step = np.arange(count) + 0.5
-    turn, height = np.pi * (3.0 - np.sqrt(5.0)) * step, 1.0 - 2.0 * step / count
-    level = np.sqrt(1.0 - height**2)
-    return np.column_stack([level * np.cos(turn), level * np.sin(turn), height])
 
 
 def read_template_mesh(path: Path, faces: Faces, up: str) -> Array:
