@@ -88,3 +88,12 @@ def test_a_mesh_with_many_vertices_in_its_hands_is_not_inside_out(tmp_path: Path
     normals = np.asarray(surface.compute_vertex_normals().vertex_normals)
     found = _read(tmp_path / "a.ply", vertices).normals
     assert np.mean(np.einsum("ni,ni->n", found, normals) > 0.0) > 0.9
+
+
+def test_a_cloud_in_a_surveyors_coordinates_loses_nothing(tmp_path: Path) -> None:
+    """Estimated normals were off, 2,000 km from the origin: a waist lost 2 mm."""
+    points = _skin()[0]
+    far = np.array([4.5e5, 2e6, 300.0])
+    near, cloud = (_read(tmp_path / "a.ply", points + shift) for shift in (0.0 * far, far))
+    assert np.mean(np.einsum("ni,ni->n", cloud.normals, near.normals) > 0.999) > 0.99
+    assert np.allclose(cloud.points + cloud.origin_m, points + far, atol=1e-8)

@@ -29,6 +29,9 @@ _UNSEEN_SOLES_M = 0.03
 """A cloud that begins this little above its z = 0 stands on it: cameras do not see soles."""
 _MAX_EXTENT_M = 12.0
 """Size of a room: a cell of the search for the person's surroundings takes memory."""
+_FAR_M = 100.0
+"""Coordinates, as surveyors have, from which a cloud is brought nearer first: squares of a thousand
+kilometres are known to 0.1 mm2, and the thickness of skin is not."""
 _OFF_FLOOR_M = 0.05
 """Largest distance of a mesh's soles from the floor, which heights are measured from."""
 
@@ -60,6 +63,9 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
             f"{path} has points {extent_m:.4g} m apart; cut the person out, or name its --unit"
         )
     _check_solid(np.asarray(cloud.points), path)
+    far = np.median(np.asarray(cloud.points), axis=0)
+    far[np.abs(far) < _FAR_M] = 0.0
+    cloud.translate(-far)
     person = standing_on(np.asarray(cloud.points))
     if person is not None:
         cloud = cloud.select_by_index(np.flatnonzero(person[0]))
@@ -71,7 +77,7 @@ def read_cloud(path: Path, up: str, unit: str = "m") -> PointCloud:
         middle[2] = 0.0 if 0.0 <= low_m < _UNSEEN_SOLES_M else low_m
     else:
         middle[2] = person[1]
-    x, y, z = (float(value) for value in middle)
+    x, y, z = (float(value) for value in far + middle)
     return PointCloud(
         points=points - middle,
         normals=normals,
