@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.depth.numbers import number, shown, whole
 from station.core.depth.png import image_of_png, png_of, png_size
 from station.core.errors import BundleError, CalibrationError, DiskReadError
 from station.core.files import OF_THE_DISK, private_folder, read_json, read_regular, write_json
@@ -123,10 +124,11 @@ def read_bundle(folder: Path) -> Bundle:
     rig = Rig.load(folder / CALIBRATION)
     try:
         frames = {
-            str(camera): tuple(_record(entry) for entry in fields["frames"])
-            for camera, fields in document["cameras"].items()
+            camera: _records(camera, fields)
+            for camera, fields in _object("cameras", document["cameras"]).items()
         }
-        scale = float(document["depth_scale_m"])
+        scale = number("depth_scale_m", document["depth_scale_m"])
+        spread_s_max = number("spread_s_max", _object("sync", document["sync"])["spread_s_max"])
         bundle = Bundle(
             folder=folder,
             scan_id=_text("scan_id", document["scan_id"]),
@@ -136,11 +138,11 @@ def read_bundle(folder: Path) -> Bundle:
             depth_scale_m=scale,
             rig=rig,
             frames=frames,
-            spread_s_max=float(document["sync"]["spread_s_max"]),
+            spread_s_max=spread_s_max,
         )
     except KeyError as missing:
         raise BundleError(f"{path}: the field {missing} is missing; scan again") from None
-    except (TypeError, ValueError, AttributeError, OverflowError) as cause:
+    except ValueError as cause:
         raise BundleError(f"{path}: {cause}; scan again") from None
     if len(frames) > MAX_CAMERAS or any(len(f) > MAX_FRAMES for f in frames.values()):
         raise BundleError(
@@ -171,8 +173,22 @@ def _text(name: str, found: object) -> str:
     return found
 
 
+def _object(name: str, found: object) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise ValueError(f"{name} is {shown(found)}, not an object {{...}}")
+    return found
+
+
+def _records(camera: str, fields: object) -> tuple[FrameRecord, ...]:
+    name = f"camera {camera!a:.80}"
+    entries = _object(name, fields)["frames"]
+    if not isinstance(entries, list):
+        raise ValueError(f"{name}: frames is {shown(entries)}, not a list")
+    return tuple(_record(_object(f"{name}: a frame", entry)) for entry in entries)
+
+
 def _record(entry: Mapping[str, Any]) -> FrameRecord:
-    file = str(entry["file"])
+    file = _text("the name of a frame's file", entry["file"])
     name = PurePosixPath(file)
     if name.is_absolute() or ".." in name.parts:
         raise ValueError(f"the frame file {file!a:.80} lies outside the bundle")
@@ -182,10 +198,10 @@ def _record(entry: Mapping[str, Any]) -> FrameRecord:
         )
     record = FrameRecord(
         file=file,
-        device_ticks=int(entry["device_ticks"]),
-        tick_hz=float(entry["tick_hz"]),
-        host_time_s=float(entry["host_time_s"]),
-        sequence=int(entry["sequence"]),
+        device_ticks=whole(f"{file}: device_ticks", entry["device_ticks"]),
+        tick_hz=number(f"{file}: tick_hz", entry["tick_hz"]),
+        host_time_s=number(f"{file}: host_time_s", entry["host_time_s"]),
+        sequence=whole(f"{file}: sequence", entry["sequence"]),
     )
     if not (math.isfinite(record.tick_hz) and record.tick_hz > 0.0):
         raise ValueError(f"{file}: tick_hz is {record.tick_hz}")

@@ -265,9 +265,9 @@ def read_json(
             raise DiskReadError(
                 f"{path} cannot be read ({cause.strerror}); check its disk"
             ) from None
-        raise error(
-            f"{path} cannot be read as JSON ({cause}); restore it from its source"
-        ) from None
+        # Behind a semicolon is advice to programmers.
+        said = str(cause).partition(";")[0]
+        raise error(f"{path} cannot be read as JSON ({said}); restore it from its source") from None
     found = document.get("format") if isinstance(document, dict) else type(document).__name__
     if found != format:
         raise error(f"{path} is not a {format} file (its format is {found!r})")

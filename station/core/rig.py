@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from station.core.depth.correction import DepthCorrection
 from station.core.depth.intrinsics import check_intrinsics
+from station.core.depth.numbers import array_of, number, shown
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
 from station.core.geometry import is_rigid
@@ -67,7 +68,7 @@ class PredictedError:
         names = ("height_sigma_m", "girth_sigma_m", "normal_rms_m", "tilt_sigma_rad")
         if not isinstance(fields, Mapping):
             raise ValueError(f"predicted must hold {', '.join(names)}")
-        values = [float(fields[name]) for name in names]
+        values = [number(f"predicted: {name}", fields[name]) for name in names]
         for name, value in zip(names, values, strict=True):
             most = _LARGEST_ERROR_RAD if name.endswith("rad") else _LARGEST_ERROR_M
             if not 0.0 <= value <= most:
@@ -162,15 +163,11 @@ class Rig:
             raise FormatError(f"{path} is missing; make it with: station calibrate")
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         try:
-            cameras = {
-                str(name): _camera(str(name), fields)
-                for name, fields in document["cameras"].items()
-            }
             rig = cls(
-                created=str(document["created"]),
-                reference=str(document["reference"]),
-                cameras=cameras,
-                residual_rms_m=float(document["residual_rms_m"]),
+                created=_text("created", document["created"]),
+                reference=_text("reference", document["reference"]),
+                cameras=_cameras(document["cameras"]),
+                residual_rms_m=number("residual_rms_m", document["residual_rms_m"]),
                 predicted=(
                     PredictedError.from_json(document["predicted"])
                     if document.get("predicted") is not None
@@ -180,7 +177,7 @@ class Rig:
             rig._check()
         except KeyError as missing:
             raise FormatError(f"{path}: the field {missing} is missing; calibrate again") from None
-        except (ValueError, TypeError, AttributeError, OverflowError) as cause:
+        except ValueError as cause:
             raise FormatError(f"{path}: {cause}; calibrate again") from None
         return rig
 
@@ -199,24 +196,51 @@ def _expect(met: bool | np.bool_, camera: str, words: str) -> None:
         raise ValueError(f"camera {camera}: {words}")
 
 
+def _text(name: str, found: object) -> str:
+    if not isinstance(found, str):
+        raise ValueError(f"{name} is {shown(found)}, not text")
+    return found
+
+
+def _cameras(found: object) -> dict[str, CameraCalibration]:
+    if not isinstance(found, dict):
+        raise ValueError('cameras must be named, as in {"front-upper": {...}}')
+    cameras = {}
+    for name, fields in found.items():
+        # Its frames lie in a folder of this name.
+        if name in ("", ".", "..") or set(name) & {"/", "\\"} or not name.isprintable():
+            raise ValueError(
+                f"camera {name!a:.80}: its name must be one of a folder, without / and \\"
+            )
+        _expect(isinstance(fields, dict), name, "it must have named fields, as K")
+        try:
+            cameras[name] = _camera(name, fields)
+        except KeyError as missing:
+            raise ValueError(f"camera {name}: the field {missing} is missing") from None
+    return cameras
+
+
 def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
     def matrix(key: str, shape: tuple[int, ...]) -> Array:
-        values = np.asarray(fields[key], dtype=np.float64)
-        finite = values.shape == shape and np.isfinite(values).all()
-        _expect(finite, name, f"{key} must be {shape} finite numbers")
+        values = array_of(fields[key])
+        if values is None or values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f"camera {name}: {key} must be {shape} finite numbers")
         return values
 
-    # Its frames lie in a folder of this name.
-    if name in ("", ".", "..") or set(name) & {"/", "\\"} or not name.isprintable():
-        raise ValueError(f"camera {name!a:.80}: its name must be one of a folder, without / and \\")
     pose = matrix("world_from_camera", (4, 4))
     _expect(is_rigid(pose), name, "world_from_camera is not a rigid transform")
     near = (np.abs(pose[:3, 3]) <= _FARTHEST_M).all()
     _expect(near, name, f"world_from_camera must lie within {_FARTHEST_M:g} m of the mark")
-    sizes = width, height = int(fields["width"]), int(fields["height"])
-    whole = sizes == (fields["width"], fields["height"])
-    possible = whole and 0 < min(sizes) <= max(sizes) <= MAX_PIXELS
-    _expect(possible, name, f"width and height must be whole numbers from 1 to {MAX_PIXELS}")
+    sizes = array_of([fields["width"], fields["height"]])
+    if (
+        sizes is None
+        or sizes.shape != (2,)
+        or not all(0 < size <= MAX_PIXELS and size % 1 == 0 for size in sizes)
+    ):
+        raise ValueError(
+            f"camera {name}: width and height must be whole numbers from 1 to {MAX_PIXELS}"
+        )
+    width, height = (int(fields[side]) for side in ("width", "height"))
     K, distortion = matrix("K", (3, 3)), matrix("distortion", (5,))
     try:
         check_intrinsics(K, distortion, width, height)
@@ -225,8 +249,8 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
         raise ValueError(f"camera {name}: {cause}") from None
     return CameraCalibration(
         name=name,
-        serial=str(fields["serial"]),
-        model=str(fields["model"]),
+        serial=_text(f"camera {name}: serial", fields["serial"]),
+        model=_text(f"camera {name}: model", fields["model"]),
         width=width,
         height=height,
         K=K,

@@ -139,7 +139,13 @@ def test_a_bundle_cannot_reach_outside_its_folder(bundle_folder: Path) -> None:
         ({"cameras": {}}, "no camera has a frame"),
         ({"depth_scale_m": 0}, "depth_scale_m is 0"),
         ({"depth_scale_m": 1}, "depth_scale_m is 1"),
-        ({"sync": None}, "scan again"),
+        ({"sync": None}, "sync is null, not an object"),
+        ({"sync": {"spread_s_max": "0.1"}}, 'spread_s_max is "0.1", not a number'),
+        ({"depth_scale_m": None}, "depth_scale_m is null, not a number"),
+        ({"depth_scale_m": 10**400}, "depth_scale_m is too large"),
+        ({"cameras": ["front"]}, "cameras is a list, not an object"),
+        ({"cameras": {"front": {"frames": {}}}}, "camera 'front': frames is an object"),
+        ({"cameras": {"front": {"frames": ["000.png"]}}}, 'a frame is "000.png", not an object'),
         ({"label": "order \ud800"}, "label is not valid text"),
         ({"label": {"order": 7}}, "label is not valid text"),
         ({"scan_id": 7}, "scan_id is not valid text"),
@@ -149,6 +155,27 @@ def test_contradictions_are_refused(
     bundle_folder: Path, changes: dict[str, object], words: str
 ) -> None:
     _edit(bundle_folder, **changes)
+    with pytest.raises(BundleError, match=words):
+        read_bundle(bundle_folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("sequence", None, r"depth/front/000\.png: sequence is null, not a number"),
+        ("sequence", True, "sequence is true, not a number"),
+        ("device_ticks", 1.5, r"device_ticks is 1\.5, not a whole number"),
+        ("host_time_s", "12", 'host_time_s is "12", not a number'),
+        ("file", None, "file is not valid text"),
+    ],
+)
+def test_a_frames_wrong_field_is_named(
+    bundle_folder: Path, key: str, value: object, words: str
+) -> None:
+    """A message of Python's own named neither: "float() argument must be a string"."""
+    cameras = json.loads((bundle_folder / "bundle.json").read_text())["cameras"]
+    cameras["front"]["frames"][0][key] = value
+    _edit(bundle_folder, cameras=cameras)
     with pytest.raises(BundleError, match=words):
         read_bundle(bundle_folder)
 

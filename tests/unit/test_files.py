@@ -33,6 +33,7 @@ def test_not_a_number_never_reaches_a_file(tmp_path: Path) -> None:
     [
         (None, "is missing"),
         ('{"format": "x", "ver', "cannot be read as JSON"),
+        (f'{{"version": {"1" * 5000}}}', "has 5000 digits); restore it"),
         ("[]", "is not a x file"),
         ('{"format": "y", "version": 1}', "its format is 'y'"),
         ('{"format": "x", "version": 9}', "version 9; this program reads 1, 2"),

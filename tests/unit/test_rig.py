@@ -96,12 +96,25 @@ def _afar(distance_m: float) -> list[list[float]]:
     return [[float(number) for number in numbers] for numbers in pose]
 
 
-def _correction(coefficients: list[float]) -> Callable[[dict[str, Any]], None]:
+def _correction(coefficients: object) -> Callable[[dict[str, Any]], None]:
     return _set(
         *_CAMERA,
         "depth_correction",
         value={"model": "inverse-depth-poly", "coefficients": coefficients},
     )
+
+
+def _field(
+    knots: list[float] | None = None, rows: int = 3, control: float = 0.0
+) -> Callable[[dict[str, Any]], None]:
+    knots = knots or [0.5, 1.0]
+    fields = {
+        "model": "inverse-depth-field",
+        "coefficients": [0.0, 1.0],
+        "inverse_depth_per_m": knots,
+        "control_per_m": np.full((len(knots), rows, 3), control).tolist(),
+    }
+    return _set(*_CAMERA, "depth_correction", value=fields)
 
 
 def _named(name: str) -> Callable[[dict[str, Any]], None]:
@@ -129,6 +142,23 @@ def _named(name: str) -> Callable[[dict[str, Any]], None]:
         (_correction([0.0]), "must leave readings between 0.5 and 4 m"),
         (_correction([1e-9] * 17), "needs 1 to 16 finite coefficients"),
         (_correction([]), "needs 1 to 16 finite coefficients"),
+        # What Python says of these names neither the camera nor the field.
+        (_set(*_CAMERA, "K", value=[[1, 2], [3]]), "camera front-upper: K must be (3, 3)"),
+        (_set(*_CAMERA, "K", value=[["585", 0, 320], [0, 585, 240], [0, 0, 1]]), "K must be"),
+        (_set(*_CAMERA, "width", value=None), "front-upper: width and height must be whole"),
+        (_set(*_CAMERA, "serial", value=None), "front-upper: serial is null, not text"),
+        (_set(*_CAMERA, "depth_correction", value=None), "front-upper: depth_correction must be"),
+        (
+            _set(*_CAMERA, value={"serial": "A001"}),
+            "camera front-upper: the field 'world_from_camera' is missing",
+        ),
+        (_set(*_CAMERA, value="A001"), "camera front-upper: it must have named fields"),
+        (_correction("01"), "needs 1 to 16 finite coefficients"),
+        (_field(knots=[1.0, 0.5]), "inverse_depth_per_m must be two or more increasing"),
+        (_field(rows=65), "control_per_m must have"),
+        (_field(control=1e300), "numbers within 100 of 0"),
+        (_set("residual_rms_m", value="2 mm"), 'residual_rms_m is "2 mm", not a number'),
+        (_set("reference", value=[]), "reference is a list, not text"),
         *(
             (_named(name), "its name must be one of a folder")
             for name in ("../x", "", "a\\b", "\n")
@@ -140,7 +170,7 @@ def _named(name: str) -> Callable[[dict[str, Any]], None]:
         (_set("predicted", value={**_PREDICTED, "tilt_sigma_rad": 4.0}), "tilt_sigma_rad must lie"),
         (_set("predicted", value={**_PREDICTED, "normal_rms_m": -1.0}), "normal_rms_m must lie"),
         (_set("cameras", value={}), "no camera"),
-        (_set("cameras", value=[1]), "calibrate again"),
+        (_set("cameras", value=[1]), "cameras must be named"),
         (lambda document: document.pop("reference"), "'reference' is missing"),
     ],
 )

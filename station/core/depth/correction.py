@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.field import DepthField
+from station.core.depth.numbers import array_of
 
 Array = NDArray[np.float64]
 
@@ -82,13 +83,17 @@ class DepthCorrection:
         return document
 
     @classmethod
-    def from_json(cls, fields: Mapping[str, Any]) -> DepthCorrection:
+    def from_json(cls, fields: object) -> DepthCorrection:
         """The correction of a camera's depth_correction in calibration.json.
 
         Raises:
             KeyError: a key is missing.
             ValueError: its model is unknown, or no camera has such a correction.
         """
+        if not isinstance(fields, Mapping):
+            raise ValueError(
+                'depth_correction must be an object with a model, as in {"model": "none"}'
+            )
         model = fields.get("model")
         if model == "none":
             return cls()
@@ -96,14 +101,20 @@ class DepthCorrection:
             raise ValueError(
                 f"depth_correction model {model!r} is unknown (known: none, {POLYNOMIAL}, {FIELD})"
             )
-        coefficients = tuple(float(value) for value in fields["coefficients"])
-        if not (0 < len(coefficients) <= _MAX_COEFFICIENTS and np.isfinite(coefficients).all()):
+        found = array_of(fields["coefficients"])
+        if (
+            found is None
+            or found.ndim != 1
+            or not 0 < len(found) <= _MAX_COEFFICIENTS
+            or not np.isfinite(found).all()
+        ):
             raise ValueError(f"depth_correction needs 1 to {_MAX_COEFFICIENTS} finite coefficients")
-        gradient = tuple(float(value) for value in fields.get("image_gradient", (0.0, 0.0)))
-        if not (len(gradient) == 2 and np.isfinite(gradient).all()):
+        gradient = array_of(fields.get("image_gradient", (0.0, 0.0)))
+        if gradient is None or gradient.shape != (2,) or not np.isfinite(gradient).all():
             raise ValueError("image_gradient must be two finite numbers")
         field = DepthField.from_json(fields) if model == FIELD else None
-        correction = cls(coefficients, (gradient[0], gradient[1]), field)
+        coefficients = tuple(float(value) for value in found)
+        correction = cls(coefficients, (float(gradient[0]), float(gradient[1])), field)
         edges = np.array([-1.0, 0.0, 1.0])
         inverse, x, y = (grid.ravel() for grid in np.meshgrid(1.0 / _DEPTHS_M, edges, edges))
         if not (correction.inverse_at(inverse, x, y) > 0.0).any():

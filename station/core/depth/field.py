@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.images import Image
+from station.core.depth.numbers import array_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 _MAX_CONTROL_POINTS = 64
 """Along an axis of a depth field; the solution uses less than twenty."""
+_MAX_PER_M = 100.0
+"""Size of a control point: a reading 1 cm away, which no sensor gives, is 100 per metre."""
 
 
 def quadratic_basis(at: Array, count: int) -> tuple[Indices, Array]:
@@ -55,19 +58,29 @@ class DepthField:
             KeyError: a key is missing.
             ValueError: it is no field of finite numbers, or has too many.
         """
-        knots = np.asarray(fields["inverse_depth_per_m"], np.float64)
-        control = np.asarray(fields["control_per_m"], np.float64)
+        knots = array_of(fields["inverse_depth_per_m"])
+        control = array_of(fields["control_per_m"])
         if (
-            control.ndim != 3
-            or knots.shape != control.shape[:1]
-            or min(control.shape) < 2
-            or min(control.shape[1:]) < 3
-            or max(control.shape) > _MAX_CONTROL_POINTS
-            or not np.isfinite(control).all()
+            knots is None
+            or knots.ndim != 1
+            or len(knots) < 2
             or not np.isfinite(knots).all()
             or not (np.diff(knots) > 0.0).all()
         ):
-            raise ValueError("the field of depth_correction is not usable")
+            raise ValueError("inverse_depth_per_m must be two or more increasing numbers")
+        if (
+            control is None
+            or control.ndim != 3
+            or len(control) != len(knots)
+            or min(control.shape[1:]) < 3
+            or max(control.shape) > _MAX_CONTROL_POINTS
+            or not (np.abs(control) < _MAX_PER_M).all()
+        ):
+            raise ValueError(
+                f"control_per_m must have for each of inverse_depth_per_m 3 to "
+                f"{_MAX_CONTROL_POINTS} rows of 3 to {_MAX_CONTROL_POINTS} numbers within "
+                f"{_MAX_PER_M:g} of 0"
+            )
         return cls(tuple(float(knot) for knot in knots), control)
 
     def at(self, inverse: Array, x: Array, y: Array) -> Array:

@@ -1,0 +1,62 @@
+"""Numbers of a JSON document. Text, true and null are none, though Python takes them for some."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def shown(found: object) -> str:
+    """A few words on what stands in a document."""
+    if isinstance(found, dict):
+        return "an object {...}"
+    return "a list" if isinstance(found, list) else json.dumps(found)[:40]
+
+
+def number(name: str, found: object) -> float:
+    """The number of a field.
+
+    Raises:
+        ValueError: it is none; the message has the field's name.
+    """
+    if not _is_number(found):
+        raise ValueError(f"{name} is {shown(found)}, not a number")
+    try:
+        return float(found)  # type: ignore[arg-type]  # it was looked at
+    except OverflowError:
+        raise ValueError(f"{name} is too large") from None
+
+
+def whole(name: str, found: object) -> int:
+    """The whole number of a field; some programs write it with a decimal point.
+
+    Raises:
+        ValueError: it is none; the message has the field's name.
+    """
+    if not number(name, found).is_integer():
+        raise ValueError(f"{name} is {shown(found)}, not a whole number")
+    return int(found)  # type: ignore[call-overload]  # it was looked at
+
+
+def array_of(found: object) -> Array | None:
+    """Numbers in a list, or in lists of one length in one another; None if they are not that."""
+    if not _all_numbers(found):
+        return None
+    try:
+        return np.asarray(found, np.float64)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _all_numbers(found: object) -> bool:
+    if isinstance(found, list | tuple):
+        return all(_all_numbers(part) for part in found)
+    return _is_number(found)
+
+
+def _is_number(found: object) -> bool:
+    return isinstance(found, int | float) and not isinstance(found, bool)
