@@ -136,10 +136,11 @@ def _file(width: int, height: int, packed: bytes) -> bytes:
 
 
 def _chunks(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def _rows(content: bytes) -> bytes:
@@ -150,3 +151,20 @@ def _rows(content: bytes) -> bytes:
             packed += content[at + 8 : at + 8 + length]
         at += 12 + length
     return packed
+
+
+@pytest.mark.parametrize("name", [b"iCCP", b"tIME", b"PLTE"])
+def test_nothing_is_said_of_what_else_a_file_holds(
+    name: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Warnings of a library stood on the terminal, between the steps of a fit."""
+    content = WRITERS["changing filters"](DEPTH)
+    found = image_of_png(content[:33] + _chunk(name, b"odd") + content[33:])
+    assert found is not None
+    assert np.array_equal(found, DEPTH)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_unknown_filter_is_torn(capfd: pytest.CaptureFixture[str]) -> None:
+    assert image_of_png(_file(64, 48, zlib.compress(b"\5".ljust(129, b"\0") * 48))) is None
+    assert capfd.readouterr() == ("", "")

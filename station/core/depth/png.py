@@ -24,7 +24,7 @@ _LARGEST_PIXEL = 8
 """Bytes."""
 _PLAIN_GREY16 = bytes([16, 0, 0, 0, 0])
 """Depth, colour, compression, filter method and interlacing of the images that are read here."""
-_UNFILTERED, _SUB = 0, 1
+_UNFILTERED, _SUB, _LAST_FILTER = 0, 1, 4
 """Filters of a row: its bytes, or their differences from the pixel before, which OpenCV writes
 unless it is told otherwise."""
 
@@ -77,9 +77,14 @@ def image_of_png(data: bytes) -> NDArray[np.uint8 | np.uint16] | None:
         if len(content) != height * rows:
             return None
         by_row = np.frombuffer(content, np.uint8).reshape(height, rows)
+        if (by_row[:, 0] > _LAST_FILTER).any():
+            return None
         image = _unfiltered(by_row[:, 0], by_row[:, 1:])
         if image is not None:
             return image
+    if data[24:26] == _PLAIN_GREY16[:2]:
+        # Its reader warns of what other chunks hold, on the terminal.
+        data = _PNG_START + data[16:33] + _chunk(b"IDAT", packed) + _chunk(b"IEND", b"")
     import cv2
 
     found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -100,6 +105,11 @@ def _image_data(data: bytes) -> bytes | None:
         at += 12 + length
     whole = at == len(data) and names[-1:] == [b"IEND"]
     return b"".join(pieces) if whole and _in_order(names) else None
+
+
+def _chunk(name: bytes, content: bytes) -> bytes:
+    checksum = zlib.crc32(name + content)
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
 
 
 def _in_order(names: list[bytes]) -> bool:
