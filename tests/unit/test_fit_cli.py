@@ -42,3 +42,24 @@ def test_half_a_body_is_told_to_be_scanned_whole(tmp_path: Path) -> None:
     done = CliRunner().invoke(fit, words)
     assert isinstance(done.exception, InputError)
     assert "scan the whole person" in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    ("out", "debug", "words"),
+    [
+        ("r" * 300, None, "cannot be made (File name too long); name another folder with --out"),
+        ("r", "r", "which has to be new; name a folder elsewhere with --debug"),
+        ("r", "r/pictures", "which has to be new; name a folder elsewhere with --debug"),
+    ],
+)
+def test_a_folder_that_cannot_be_made_is_told_before_the_fit(
+    tmp_path: Path, out: str, debug: str | None, words: str
+) -> None:
+    """A fit was made first, and lost, or "somebody else" had made its folder."""
+    body = tmp_path / "body.ply"
+    body.write_text("no cloud, which a fit would tell")
+    options = [] if debug is None else ["--debug", str(tmp_path / debug)]
+    done = CliRunner().invoke(fit, ["--cloud", str(body), "--out", str(tmp_path / out), *options])
+    assert isinstance(done.exception, InputError)
+    assert words in str(done.exception)
+    assert list(tmp_path.iterdir()) == [body]

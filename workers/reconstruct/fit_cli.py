@@ -158,13 +158,26 @@ def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:
     Raises:
         InputError: one of them cannot be made, or holds another fit's files.
     """
-    # A link that leads nowhere does not exist, but a folder cannot take its name.
-    if os.path.lexists(out_folder):
+    try:
+        # A link that leads nowhere does not exist, but a folder cannot take its name.
+        out_folder.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as cause:
+        raise InputError(
+            f"{out_folder} cannot be made ({cause.strerror}); name another folder with --out"
+        ) from None
+    else:
         raise InputError(f"{out_folder} exists already; name a new folder with --out")
     writable_folder(out_folder.parent, "--out")
     if debug_folder is not None:
         from workers.pictures.debug_pictures import has_pictures
 
+        if debug_folder.resolve().is_relative_to(out_folder.resolve()):
+            raise InputError(
+                f"{debug_folder} would lie in {out_folder}, which has to be new; name a folder "
+                "elsewhere with --debug"
+            )
         if has_pictures(debug_folder):
             raise InputError(
                 f"{debug_folder} has pictures of a fit already; name a new folder with --debug"
