@@ -33,6 +33,7 @@ _OPTIONAL = {
     "or pip install 'body-booth[simulation]'",
 }
 """A library that may be missing -> the remedy."""
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
 _NO_ACCESS = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG)
 _NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
@@ -143,10 +144,11 @@ class _Ended(SystemExit):
     code: signal.Signals
 
 
-def _terminate(*_: object) -> None:
+def _terminate(number: int, _: object) -> None:
     # A second signal must not end what cleans up after the first.
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise _Ended(signal.SIGTERM)
+    for other in _ENDING:
+        signal.signal(other, signal.SIG_IGN)
+    raise _Ended(signal.Signals(number))
 
 
 def _tell(error: str) -> None:
@@ -160,12 +162,15 @@ def _tell(error: str) -> None:
 def run(group: click.Group) -> None:
     """Call a command; an error that the user can act upon becomes one line and exit code 1.
 
-    SIGTERM and Ctrl-C end it as they would by default, without a word of its own, once folders that
-    were made for its time are gone. Processes that run until they are stopped handle them
-    themselves.
+    SIGTERM, a closed terminal and Ctrl-C end it as they would by default, without a word of its
+    own, once folders that were made for its time are gone. Processes that run until they are
+    stopped handle them themselves.
     """
     set_up_caches()
-    signal.signal(signal.SIGTERM, _terminate)
+    for number in _ENDING:
+        # nohup ignores the signal of a closed terminal.
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _terminate)
     try:
         group()
     except _Ended as ended:

@@ -59,9 +59,13 @@ _PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), 
 
 
 def stop_event() -> threading.Event:
-    """Set by SIGTERM and SIGINT; a process' main loop watches it."""
+    """Set by SIGTERM, SIGINT and a closed terminal; a process' main loop watches it."""
     stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    numbers = [signal.SIGTERM, signal.SIGINT]
+    # nohup ignores the signal of a closed terminal.
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
         signal.signal(number, lambda *_: stop.set())
     return stop
 

@@ -168,8 +168,11 @@ def test_a_folder_is_no_file_for_a_model(tmp_path: Path) -> None:
     assert "is a directory" in done.output
 
 
-def test_a_command_that_is_told_to_end_leaves_no_folder(tmp_path: Path) -> None:
-    """Half a result stayed beside --out."""
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_told_to_end_leaves_no_folder(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """Half a result stayed beside --out, also where its terminal was closed."""
     source = (
         "import click, tempfile, time\n"
         "from station.core.commands import run\n"
@@ -184,9 +187,31 @@ def test_a_command_that_is_told_to_end_leaves_no_folder(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as waiting:
         assert waiting.stdout is not None
         assert waiting.stdout.readline() == "waits\n"
-        waiting.terminate()
-        assert waiting.wait(20.0) == -signal.SIGTERM
+        waiting.send_signal(number)
+        assert waiting.wait(20.0) == -number
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_command_under_nohup_outlives_its_terminal() -> None:
+    source = (
+        "import click, signal\n"
+        "from station.core.commands import run\n"
+        "from station.core.service import stop_event\n"
+        "@click.group(invoke_without_command=True)\n"
+        "def stays():\n"
+        "    stop = stop_event()\n"
+        "    signal.raise_signal(signal.SIGHUP)\n"
+        "    print('stopped' if stop.is_set() else 'stays')\n"
+        "run(stays)\n"
+    )
+    ignoring = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); exec({source!r})"
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        for code in (source, ignoring)
+    ]
+    assert said == ["stopped\n", "stays\n"]
 
 
 def test_rendering_that_is_told_to_end_leaves_no_semaphores(tmp_path: Path) -> None:

@@ -35,8 +35,9 @@ def main() -> None:
     if len(sys.argv) > 1:
         die_with_parent(int(sys.argv[1]))
     set_up_caches()
-    # Ctrl-C on a terminal reaches the whole group; the pool decides when to end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C on a terminal, or its end, reaches the whole group; the pool decides when to end.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     # Libraries print to stdout; the pipe to the pool must carry only messages of this process.
     channel = os.dup(1)
     os.dup2(2, 1)
