@@ -182,6 +182,21 @@ def test_the_floor_and_what_stands_on_it_are_taken_away(tmp_path: Path) -> None:
     assert cloud.origin_m[2] == pytest.approx(-0.4, abs=0.005)
 
 
+def test_one_of_two_people_on_a_floor_is_not_chosen(tmp_path: Path) -> None:
+    """One of them was measured, with "ok"; a wall and a pole beside the person are none."""
+    rng = np.random.default_rng(3)
+    floor = np.column_stack([rng.uniform(-1.5, 1.5, (20_000, 2)), np.zeros(20_000)])
+    wall = rng.uniform((-0.8, 1.2, 0.0), (0.8, 1.21, 2.0), (7000, 3))
+    pole = rng.uniform((1.0, -1.0, 0.0), (1.05, -0.95, 2.0), (7000, 3))
+    alone = np.concatenate([_person(rng), floor, wall, pole])
+    cloud = read_cloud(_written(tmp_path / "a.ply", alone), "z")
+    assert len(cloud) <= 8000
+    assert several_people(cloud) == ()
+    both = np.concatenate([alone, _person(rng, 6000) + np.array([0.9, -0.3, 0.0])])
+    (found,) = several_people(read_cloud(_written(tmp_path / "b.ply", both), "z"))
+    assert found.message.startswith("two people")
+
+
 @pytest.mark.parametrize("tilt_deg", [2.0, 4.0, 10.0])
 def test_a_tilted_floor_is_named(tmp_path: Path, tilt_deg: float) -> None:
     """It was left in the cloud, and the verdict spoke of the person's front."""

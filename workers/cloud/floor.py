@@ -44,6 +44,11 @@ _FOOT_M, _AROUND_FEET_M, _FEWEST_NEAR = 0.06, 0.15, 50
 """Height of feet above the floor, how far around them it is what they stand on, and its fewest
 points."""
 _VOXEL_M = 0.04
+_SECOND_PERSON_SHARE, _SECOND_PERSON_HEIGHT_M = 0.15, 1.1
+"""Share of the largest piece's points, and height, of what else may be a person (`one_person`)."""
+_THICK_M = 0.03
+"""Least standard deviation of such a person's points along a level direction: 0.07 and more of the
+demo bodies' are, and less than 0.02 of a wall or a pole."""
 _PLANE_ROUNDS = 4
 _LEVEL = np.tan(np.radians(1.5))
 """Slope of a floor from which the cloud is not level: the body would lean by it, and stand on one
@@ -90,7 +95,8 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
     """Points (n,) of a person who stands on a floor that was scanned too, and the floor's height
     below them in metres; None where no floor was scanned.
 
-    What stands apart from the person goes with the floor.
+    What stands apart from the person goes with the floor, unless it may be another person: whose
+    measurements are asked for is not known then.
 
     Args:
         points: (n, 3), metres, z up.
@@ -108,7 +114,7 @@ def standing_on(points: Array) -> tuple[Mask, float] | None:
         raise _not_level(float(np.arctan(np.linalg.norm(plane[:2]))))
     above_m = points[:, 2] - points[:, :2] @ plane[:2] - plane[2]
     over = above_m > _CLEARANCE_M
-    person = np.flatnonzero(over)[_largest_piece(points[over])]
+    person = np.flatnonzero(over)[_people(points[over])]
     plane[2] += _under_feet_m(points, above_m, person)
     kept = np.zeros(len(points), bool)
     kept[person] = True
@@ -211,8 +217,8 @@ def _covered_m2(points: Array) -> float:
     return len(cells) * _CELL_M**2
 
 
-def _largest_piece(points: Array) -> NDArray[np.intp]:
-    """Indices of the largest connected piece of a cloud (n, 3)."""
+def _people(points: Array) -> NDArray[np.intp]:
+    """Indices of a cloud's (n, 3) largest connected piece, and of others that may be people."""
     cells = np.floor((points - points.min(axis=0)) / _VOXEL_M).astype(np.int64) + 1
     shape = tuple(int(size) for size in cells.max(axis=0) + 2)
     cell = np.ravel_multi_index(tuple(cells.T), shape)
@@ -220,4 +226,17 @@ def _largest_piece(points: Array) -> NDArray[np.intp]:
     occupied.flat[cell] = True
     labels, _ = ndimage.label(ndimage.binary_dilation(occupied))
     label = labels.flat[cell]
-    return np.flatnonzero(label == np.argmax(np.bincount(label)))
+    sizes = np.bincount(label)
+    largest = int(np.argmax(sizes))
+    people = [
+        piece
+        for piece in np.flatnonzero(sizes > _SECOND_PERSON_SHARE * sizes[largest])
+        if piece == largest or _may_be_person(points[label == piece])
+    ]
+    return np.flatnonzero(np.isin(label, people))
+
+
+def _may_be_person(points: Array) -> bool:
+    """Whether a piece (n, 3) is as high as people are, and neither a wall nor a pole."""
+    thickness_m = np.sqrt(np.linalg.eigvalsh(np.cov(points[:, :2].T))[0])
+    return bool(np.ptp(points[:, 2]) > _SECOND_PERSON_HEIGHT_M and thickness_m > _THICK_M)
