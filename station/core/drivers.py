@@ -41,6 +41,8 @@ def plain_name(name: str) -> str:
 
 
 def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
+    if not str(path).isprintable():
+        raise ValueError("must be a path without control characters: write '...', not \"...\\...\"")
     base = (info.context or {}).get(BASE_FOLDER)
     return path if base is None else base / path
 

@@ -52,6 +52,8 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         ),
         (_CAMERA + "[drift]\nrefuse_scans = 1", "must be true or false, without quotes (found 1)"),
         (_CAMERA + "[spool]\nfolder = 3", "spool.folder: must be a path in quotes (found 3)"),
+        (_CAMERA + '[spool]\nfolder = "a\\u0000"', "spool.folder: must be a path without control"),
+        (_CAMERA + '[runtime]\nfolder = "D:\\temp"', "runtime.folder: must be a path without"),
         ("spool = 3\n" + _CAMERA, "spool: must be a section with keys of its own (found 3)"),
         ("name = 3\n" + _CAMERA, "name: must be a text in quotes (found 3)"),
         (f"name = '{61 * 'a'}'\n" + _CAMERA, "name: must have at most 60 characters"),
