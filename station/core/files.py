@@ -23,6 +23,8 @@ PRIVATE_FOLDER_MODE = 0o700
 PRIVATE_FILE_MODE = 0o600
 OF_THE_DISK = (errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """Reasons why a file cannot be read that are not its own and may pass."""
+_LONGEST_TIME = 32
+"""Letters of a time with microseconds and its offset."""
 _LOCK_TRIES, _LOCK_PAUSE_S = 4, 0.05
 MAX_JSON_BYTES = 16 << 20
 """A bundle of 100 frames of 8 cameras takes 0.2 MB, a result's paths and parameters 1 MB."""
@@ -34,7 +36,8 @@ def utc_now(precision: Literal["seconds", "milliseconds"] = "seconds") -> str:
 
 
 def local_time(moment: str) -> str:
-    """A time in UTC, ISO 8601, as the booth's clock on the wall shows it; others stay as they are.
+    """A time in UTC, ISO 8601, as the booth's clock on the wall shows it; others stay as they are,
+    but for control characters, which must not reach a terminal, and for what is longer than a time.
 
     For what people read; files and programs keep UTC.
     """
@@ -44,7 +47,7 @@ def local_time(moment: str) -> str:
             then = then.replace(tzinfo=UTC)
         return then.astimezone().strftime("%Y-%m-%d %H:%M:%S")
     except (ValueError, OverflowError):
-        return moment
+        return "".join(c if c.isprintable() else "?" for c in moment[:_LONGEST_TIME])
 
 
 def fsync_folder(folder: Path) -> None:

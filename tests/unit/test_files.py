@@ -21,6 +21,14 @@ def test_json_round_trip(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_what_is_no_time_stays_in_its_line() -> None:
+    """A bundle of another program may say anything; its lines in `station list` broke."""
+    assert files.local_time("yesterday") == "yesterday"
+    assert files.local_time("a\nb\x1b[31m") == "a?b?[31m"
+    assert files.local_time(1000 * "c") == 32 * "c"
+    assert files.local_time("2026-11-21T10:00:00Z").startswith("2026-11-2")
+
+
 def test_not_a_number_never_reaches_a_file(tmp_path: Path) -> None:
     """json.dumps writes NaN by default, which other languages' readers refuse."""
     with pytest.raises(ValueError):
