@@ -37,6 +37,8 @@ from station.core.words.terms import Language, verdict_words
 
 _WIDTH, _HEIGHT = A4
 _MARGIN = 34.0
+_MOST_LETTERS = 200
+"""Letters of a label that are looked at: no more than a hundred fit into the head."""
 _FIGURE_TOP, _FIGURE_HEIGHT = _HEIGHT - 104.0, 316.0
 _ROW_HEIGHT = 13.6
 _DIFFERENCE = 60.0
@@ -137,10 +139,8 @@ def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: La
     _text(
         canvas, _WIDTH - _MARGIN - width + 12, _HEIGHT - 57, verdict, 22, HexColor("#ffffff"), True
     )
-    label = scan.label or words["unlabelled"]
     room = _WIDTH - 2 * _MARGIN - width - 16
-    while len(label) > 4 and _width(label, 20, bold=True) > room:
-        label = label[:-2] + "…"
+    label = _cut(scan.label or words["unlabelled"], room)
     _text(canvas, _MARGIN, _HEIGHT - 52, label, 20, _INK, True)
     moment = scan.created.replace("T", "  ").removesuffix("Z") + " UTC"
     facts = [moment, scan.scan_id, scan.booth, words[pose], unit]
@@ -150,6 +150,14 @@ def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: La
         _text(canvas, _MARGIN, _HEIGHT - 82, reasons[:150], 8, colour)
     canvas.setStrokeColor(_RULE)
     canvas.line(_MARGIN, _HEIGHT - 90, _WIDTH - _MARGIN, _HEIGHT - 90)
+
+
+def _cut(label: str, room: float) -> str:
+    """A label, cut to the width of the head."""
+    label = label[:_MOST_LETTERS]
+    while len(label) > 4 and _width(label, 20, bold=True) > room:
+        label = label[:-2] + "…"
+    return label
 
 
 def _figures(

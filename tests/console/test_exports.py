@@ -22,6 +22,7 @@ import pytest
 from click.testing import CliRunner
 from live_console import LiveConsole
 
+from station.archive import sheet
 from station.archive.compare import compare_rows
 from station.archive.index import ScanIndex
 from station.archive.records import ScanRecord
@@ -155,6 +156,22 @@ def test_the_sheet_has_the_whole_table_on_one_page(
     assert re.search(r"± \d\.\d\s*\*\*", text)
     chinese = sheet_pdf(scan, folder, "as-scanned", "in", "zh")
     assert len(pypdf.PdfReader(io.BytesIO(chinese)).pages) == 1
+
+
+def test_a_long_label_is_cut_without_a_look_at_each_letter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The sheet of a scan with a label of 100,000 letters, which a bundle may have, took hours."""
+    looks = []
+
+    def width(text: str, size: float, bold: bool = False) -> float:
+        looks.append((size, bold))
+        return float(len(text))
+
+    monkeypatch.setattr(sheet, "_width", width)
+    assert sheet._cut("i" * 100_000, 40.0) == "i" * 39 + "…"
+    assert len(looks) < 200
+    assert sheet._cut("Order 1", 40.0) == "Order 1"
 
 
 def test_the_sheet_of_a_body_without_a_neck_to_measure(
