@@ -176,5 +176,7 @@ def csv_table(scan: ScanRecord, document: dict[str, Any], unit: Unit, language: 
 
 
 def _harmless(text: str) -> str:
-    """A label is arbitrary text: a spreadsheet must not interpret it as a formula."""
-    return f"'{text}" if text.startswith(_FORMULA) else text
+    """A label is arbitrary text: a spreadsheet must not interpret it as a formula, and many readers
+    of CSV end at a zero or take a line break for the end of a row."""
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return f"'{line}" if text.startswith(_FORMULA) else line

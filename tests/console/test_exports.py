@@ -78,6 +78,11 @@ def test_a_label_is_never_a_formula() -> None:
     assert rows(_DOCUMENT, "in", "en")[0]["value"] == 33.15
 
 
+def test_a_label_stays_in_its_cell() -> None:
+    table = csv_table(_scan("Order\x00 1\nred\x1b[31m"), _DOCUMENT, "cm", "en")
+    assert table.splitlines()[1].startswith("Order  1 red [31m,")
+
+
 def test_a_spreadsheet_is_in_one_language() -> None:
     """The basis was English in the Chinese one."""
 
