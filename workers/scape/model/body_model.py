@@ -181,8 +181,7 @@ class BodyModel:
         return so3_log(relative)
 
     def absolute_rotations(self, twists: Array) -> Array:
-        """Absolute rotations (..., L, 3, 3) of relative twists (..., L, 3): inverse of
-        `relative_twists`."""
+        """Absolute rotations (..., L, 3, 3) of relative twists: inverse of `relative_twists`."""
         rotations = so3_exp(twists)
         by_part = np.moveaxis(rotations, -3, 0)
         for part, parent in enumerate(self.part_parents):
