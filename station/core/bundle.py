@@ -198,7 +198,7 @@ def _record(entry: Mapping[str, Any]) -> FrameRecord:
         )
     record = FrameRecord(
         file=file,
-        device_ticks=whole(f"{file}: device_ticks", entry["device_ticks"]),
+        device_ticks=whole(f"{file}: device_ticks", entry["device_ticks"], parts=True),
         tick_hz=number(f"{file}: tick_hz", entry["tick_hz"]),
         host_time_s=number(f"{file}: host_time_s", entry["host_time_s"]),
         sequence=whole(f"{file}: sequence", entry["sequence"]),

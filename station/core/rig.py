@@ -249,7 +249,7 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
         raise ValueError(f"camera {name}: {cause}") from None
     return CameraCalibration(
         name=name,
-        serial=_text(f"camera {name}: serial", fields["serial"]),
+        serial=_text(f"camera {name}: serial", fields["serial"] or ""),
         model=_text(f"camera {name}: model", fields["model"]),
         width=width,
         height=height,

@@ -40,6 +40,16 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     assert found.depth_correction == expected.depth_correction
 
 
+def test_a_serial_number_that_is_not_known_is_empty(tmp_path: Path) -> None:
+    """It was "None"."""
+    path = tmp_path / "calibration.json"
+    make_rig().save(path)
+    document = json.loads(path.read_text())
+    document["cameras"]["front-upper"]["serial"] = None
+    path.write_text(json.dumps(document))
+    assert Rig.load(path).cameras["front-upper"].serial == ""
+
+
 def test_corrections_and_predicted_errors_are_read_again(tmp_path: Path) -> None:
     """The calibration's own errors have to reach the measurements' intervals."""
     control = np.random.default_rng(3).normal(0.0, 1e-3, (3, 4, 5))
@@ -146,7 +156,7 @@ def _named(name: str) -> Callable[[dict[str, Any]], None]:
         (_set(*_CAMERA, "K", value=[[1, 2], [3]]), "camera front-upper: K must be (3, 3)"),
         (_set(*_CAMERA, "K", value=[["585", 0, 320], [0, 585, 240], [0, 0, 1]]), "K must be"),
         (_set(*_CAMERA, "width", value=None), "front-upper: width and height must be whole"),
-        (_set(*_CAMERA, "serial", value=None), "front-upper: serial is null, not text"),
+        (_set(*_CAMERA, "serial", value=7), "front-upper: serial is 7, not text"),
         (_set(*_CAMERA, "depth_correction", value=None), "front-upper: depth_correction must be"),
         (
             _set(*_CAMERA, value={"serial": "A001"}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +32,17 @@ def number(name: str, found: object) -> float:
         raise ValueError(f"{name} is too large") from None
 
 
-def whole(name: str, found: object) -> int:
+def whole(name: str, found: object, *, parts: bool = False) -> int:
     """The whole number of a field; some programs write it with a decimal point.
+
+    Args:
+        parts: leave out what is behind the point, as of a moment that was computed.
 
     Raises:
         ValueError: it is none; the message has the field's name.
     """
-    if not number(name, found).is_integer():
+    value = number(name, found)
+    if not (value.is_integer() or (parts and math.isfinite(value))):
         raise ValueError(f"{name} is {shown(found)}, not a whole number")
     return int(found)  # type: ignore[call-overload]  # it was looked at
 
