@@ -136,6 +136,32 @@ def test_a_scan_that_is_done_again_counts_once_for_the_cameras(
     assert len(list((spool.folder / "cameras").iterdir())) == 1
 
 
+def test_a_job_that_ends_while_it_is_asked_about_ends_no_workers(
+    spool: Spool, tmp_path: Path
+) -> None:
+    """Two looks at it, and its end between them, would have stopped all workers."""
+
+    class Ending(Worker):
+        looks = 0
+
+        @property
+        def _busy(self) -> Any:
+            self.looks += 1
+            return SimpleNamespace(compiling=True) if self.looks == 1 else None
+
+        @_busy.setter
+        def _busy(self, _: object) -> None:
+            """Nothing is kept."""
+
+    stop = threading.Event()
+    stop.set()
+    (tmp_path / "booth.toml").write_text(_CAMERA)
+    worker = Ending(load_config(tmp_path / "booth.toml"), spool, stop, logging.getLogger())
+    worker.thread.join()
+    assert worker.compiling
+    assert not worker.compiling
+
+
 def test_old_scans_are_removed_and_new_ones_kept(spool: Spool) -> None:
     for state in ("done", "outbox", "queue"):
         spool.path(state, "a").mkdir()

@@ -142,7 +142,8 @@ class Worker:
     @property
     def compiling(self) -> bool:
         """Whether its scan waits until what a job needs is compiled."""
-        return self._busy is not None and self._busy.compiling
+        busy = self._busy  # its thread may end the job meanwhile
+        return busy is not None and busy.compiling
 
     def _warm_another(self) -> None:
         """The next job's process warms up while this one works."""
