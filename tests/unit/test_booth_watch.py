@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -350,6 +351,35 @@ def _refuses(tasks: Tasks) -> bool:
     except RefusedError as error:
         return "nothing is waiting" in str(error)
     return False
+
+
+class _Torn(Pictures):
+    """Pictures of frames that are all torn."""
+
+    def _packed(self, newest: dict[str, list[zmq.Frame]]) -> bytes:  # noqa: ARG002
+        raise ValueError("torn")
+
+
+def test_a_bad_frame_is_not_told_again_when_nobody_looks(
+    one_camera: BoothConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whoever had asked and left was waited for, with a line in the log each second."""
+    pictures = _Torn(one_camera, logging.getLogger())
+
+    async def leave() -> None:
+        asked = asyncio.create_task(pictures.next())
+        await asyncio.sleep(0)
+        asked.cancel()
+        with suppress(asyncio.CancelledError):
+            await asked
+
+    asyncio.run(leave())
+    pictures.start()
+    try:
+        _until(lambda: "depth pictures: torn" in caplog.text)
+        assert not pictures._wanted.is_set()
+    finally:
+        pictures.close()
 
 
 def test_a_bad_frame_costs_a_viewer_no_more_than_that_picture(

@@ -102,7 +102,8 @@ class Pictures:
                     packed = self._packed(fresh)
                 except BaseException:
                     with self._lock:
-                        self._waiting[:0] = waiting  # for the pictures after the fault
+                        # Who still waits gets the pictures after the fault.
+                        self._waiting[:0] = [future for future in waiting if not future.done()]
                     raise
                 _give(waiting, packed)
         finally:
