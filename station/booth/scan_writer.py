@@ -207,9 +207,10 @@ class ScanWriter:
         """
         if not cameras:
             return
-        self._begun_s = None  # no disk is waited for
         try:
-            self._drift.prepare(booth_rig(self._config).cameras[cameras[0]])
+            camera = booth_rig(self._config).cameras[cameras[0]]
+            self._begun_s = None  # on a busy computer it lasts, and no disk is waited for
+            self._drift.prepare(camera)
         except (BoothError, OSError):
             return  # a scan will say why
         self._tasks.put(partial(self._prepare_check, cameras[1:]))

@@ -9,10 +9,13 @@ import time
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from station.booth import scan_writer
 from station.booth.collection import Collection, Order
 from station.booth.frameset import Frameset
 from station.booth.scan_writer import Ended, ScanWriter, Started
@@ -20,7 +23,8 @@ from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
-from station.core.rig import CameraCalibration
+from station.core.config_file import load_config
+from station.core.rig import CameraCalibration, Rig
 from station.core.scans import ScanId
 from station.messaging.intake import LiveFrame
 from station.messaging.messages import FrameHeader
@@ -122,6 +126,65 @@ def test_the_check_for_moved_cameras_is_prepared_before_a_scan(one_camera: Booth
     try:
         assert check.cameras.get(timeout=20.0) == "front-lower"
     finally:
+        writer.close()
+
+
+class _Paused(_Prepared):
+    """A preparation that goes on with each camera when it is told to."""
+
+    def __init__(self, store: CalibrationStore) -> None:
+        super().__init__(store)
+        self.goes_on = threading.Semaphore(0)
+
+    def prepare(self, camera: CameraCalibration) -> None:
+        super().prepare(camera)
+        assert self.goes_on.acquire(timeout=20.0)
+
+
+def test_an_order_waits_for_one_camera_of_the_preparation(tmp_path: Path) -> None:
+    rig, path = default_rig(), tmp_path / "booth.toml"
+    cameras = [
+        f'[[cameras]]\nname = "{n}"\ndriver = "recorded"\nrecording = "{n}"\n' for n in rig.cameras
+    ]
+    path.write_text("".join(cameras))
+    config = load_config(path)
+    store, names = CalibrationStore.of(config), list(rig.cameras)
+    rig.save(store.in_use)
+    check = _Paused(store)
+    writer = ScanWriter(config, check, logging.getLogger())
+    try:
+        assert check.cameras.get(timeout=20.0) == names[0]
+        writer.begin(Order(ScanId("a"), "", 1e9))
+        assert writer.stalled(time.monotonic() + 60.0) == ""
+        check.goes_on.release()
+        assert check.cameras.get(timeout=20.0) == names[1]
+        assert [type(event) for event in writer.events()] == [Started]
+        check.goes_on.release(len(names))
+        assert [check.cameras.get(timeout=20.0) for _ in names[2:]] == names[2:]
+    finally:
+        check.goes_on.release(len(names))
+        writer.close()
+
+
+def test_a_disk_that_hangs_at_the_preparation_is_told(
+    one_camera: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Orders that waited for it were not told why."""
+    begun, end = threading.Event(), threading.Event()
+
+    def hanging(_: BoothConfig) -> Rig:
+        begun.set()
+        end.wait(20.0)
+        raise OSError("it is gone")
+
+    monkeypatch.setattr(scan_writer, "booth_rig", hanging)
+    check = DriftWatch(CalibrationStore.of(one_camera))
+    writer = ScanWriter(one_camera, check, logging.getLogger())
+    try:
+        assert begun.wait(20.0)
+        assert "the spool's disk has not answered" in writer.stalled(time.monotonic() + 60.0)
+    finally:
+        end.set()
         writer.close()
 
 
