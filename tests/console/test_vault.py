@@ -71,6 +71,8 @@ def test_a_key_that_another_request_forgets_meanwhile_is_new(tmp_path: Path) -> 
     """It was a server error."""
     vault = _Hurried(tmp_path)
     assert vault.remember("key", "request", "answer") == ("request", "answer")
+    Vault(tmp_path).remember("other", "request", "first")
+    assert vault.remember("other", "request", "answer") == ("request", "answer")
     vault.close()
 
 
@@ -107,6 +109,15 @@ def _nothing_written() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_key_has_its_answer_on_a_full_disk(vault: Vault) -> None:
+    """A program that asked once more got "the disk cannot be written", not its scan."""
+    vault.remember("key", "request", "first")
+    with _nothing_written():
+        assert vault.remember("key", "request", "second") == ("request", "first")
+        with pytest.raises(OSError, match=r"console\.sqlite"):
+            vault.remember("other", "request", "first")
 
 
 def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:

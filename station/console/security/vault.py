@@ -192,13 +192,15 @@ class Vault:
         """
         now = time.time()
         self._run("DELETE FROM keys WHERE made < ?", now - _KEYS_KEPT_S)
-        # In one statement: another request with this key may be refused, and forget it.
-        [found] = self._run(
-            "INSERT INTO keys VALUES (?, ?, ?, ?) ON CONFLICT (key) DO UPDATE SET key = key "
-            "RETURNING request, answer",
-            key, request, answer, now,
-        )  # fmt: skip
-        return str(found[0]), str(found[1])
+        found: list[tuple[object, ...]] = []
+        # Another request with this key may be refused between the two, and forget it. Nothing is
+        # written where it has an answer, for which a full disk would have no room.
+        while not found:
+            found = self._run(
+                "INSERT OR IGNORE INTO keys VALUES (?, ?, ?, ?) RETURNING request, answer",
+                key, request, answer, now,
+            ) or self._run("SELECT request, answer FROM keys WHERE key = ?", key)  # fmt: skip
+        return str(found[0][0]), str(found[0][1])
 
     def forget(self, key: str) -> None:
         """Free an idempotency key: what it asked for was refused."""
