@@ -120,6 +120,16 @@ def test_a_key_has_its_answer_on_a_full_disk(vault: Vault) -> None:
             vault.remember("other", "request", "first")
 
 
+def test_a_disk_that_became_read_only_keeps_the_memory_as_it_is(vault: Vault) -> None:
+    """Whoever sent cookies of no session, without end, filled it."""
+    session = vault.open_session(1.0)
+    vault._database.execute("PRAGMA query_only = ON")
+    for secret in ("none", session, session):
+        vault.close_session(secret)
+    assert not vault.session_holds(session)
+    assert len(vault._ended) == 1
+
+
 def test_a_disk_that_refuses_a_new_database_is_told(tmp_path: Path) -> None:
     """The console ended with a traceback from sqlite whenever it was started."""
     with _nothing_written(), pytest.raises(OSError, match=r"console\.sqlite"):
