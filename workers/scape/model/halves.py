@@ -5,6 +5,7 @@ Threads are kept, since to start one takes as long as a small half.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
@@ -43,3 +44,7 @@ def started(
 @lru_cache(maxsize=1)
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_MOST_THREADS)
+
+
+# A forked process has none of them, and would wait for ever.
+os.register_at_fork(after_in_child=_threads.cache_clear)
