@@ -9,6 +9,7 @@ of `CameraConfig`. No other place lists the drivers.
 from __future__ import annotations
 
 import re
+import unicodedata
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,7 +42,8 @@ def plain_name(name: str) -> str:
 
 
 def _beside_the_file(path: Path, info: ValidationInfo) -> Path:
-    if not str(path).isprintable():
+    # Such as a tab or an escape; spaces of all scripts are no such characters.
+    if any(unicodedata.category(letter) == "Cc" for letter in str(path)):
         raise ValueError("must be a path without control characters: write '...', not \"...\\...\"")
     base = (info.context or {}).get(BASE_FOLDER)
     return path if base is None else base / path

@@ -123,3 +123,9 @@ def test_the_example_is_a_booth() -> None:
     config = load_config(example)
     assert len(config.cameras) == 4
     assert config.volume.max_m == (0.95, 0.75, 2.2)
+
+
+def test_a_folder_may_have_spaces_of_any_script(tmp_path: Path) -> None:
+    path = tmp_path / "booth.toml"
+    path.write_text(_CAMERA + '[spool]\nfolder = "\u6d4b\u91cf\u3000\u4e00"\n')
+    assert load_config(path).spool.folder.name == "\u6d4b\u91cf\u3000\u4e00"

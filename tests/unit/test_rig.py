@@ -127,6 +127,10 @@ def _field(
     return _set(*_CAMERA, "depth_correction", value=fields)
 
 
+def _nested(depth: int) -> list[Any]:
+    return [_nested(depth - 1)] if depth else []
+
+
 def _named(name: str) -> Callable[[dict[str, Any]], None]:
     return lambda document: document["cameras"].update({name: document["cameras"]["front-upper"]})
 
@@ -155,6 +159,7 @@ def _named(name: str) -> Callable[[dict[str, Any]], None]:
         # What Python says of these names neither the camera nor the field.
         (_set(*_CAMERA, "K", value=[[1, 2], [3]]), "camera front-upper: K must be (3, 3)"),
         (_set(*_CAMERA, "K", value=[["585", 0, 320], [0, 585, 240], [0, 0, 1]]), "K must be"),
+        (_set(*_CAMERA, "K", value=_nested(900)), "camera front-upper: K must be (3, 3)"),
         (_set(*_CAMERA, "width", value=None), "front-upper: width and height must be whole"),
         (_set(*_CAMERA, "serial", value=7), "front-upper: serial is 7, not text"),
         (_set(*_CAMERA, "depth_correction", value=None), "front-upper: depth_correction must be"),

@@ -49,11 +49,9 @@ def whole(name: str, found: object, *, parts: bool = False) -> int:
 
 def array_of(found: object) -> Array | None:
     """Numbers in a list, or in lists of one length in one another; None if they are not that."""
-    if not _all_numbers(found):
-        return None
     try:
-        return np.asarray(found, np.float64)
-    except (ValueError, OverflowError):
+        return np.asarray(found, np.float64) if _all_numbers(found) else None
+    except (ValueError, OverflowError, RecursionError):
         return None
 
 
