@@ -62,14 +62,19 @@ class Collection:
         return scales.pop()
 
 
-def went_silent_words(silent: Sequence[str], recorded: Set[str]) -> str:
+def went_silent_words(
+    silent: Sequence[str], recorded: Set[str], off: Set[str] = frozenset()
+) -> str:
     """Cause and remedy where cameras stopped sending frames during a scan; empty if none did.
 
     Args:
         recorded: as in `check_words`.
+        off: those that were switched off.
     """
     if not silent:
         return ""
+    if set(silent) <= off:
+        return "the sensors were stopped during the scan; run station start first; scan again"
     remedy = check_words(silent, recorded)
     return (
         f"camera {silent[0]} went silent; {remedy}; scan again"

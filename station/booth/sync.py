@@ -166,7 +166,7 @@ class SyncProcess:
         self._collection = None
         reason = (
             "; ".join(self._troubles())
-            or went_silent_words(self._silent(), self._config.recorded)
+            or went_silent_words(self._silent(), self._config.recorded, self._intake.off())
             or self._too_slow_words(len(collection.sets))
         )
         self._fail(collection.order, reason)

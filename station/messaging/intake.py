@@ -78,6 +78,10 @@ class FrameIntake:
             name for name in self._cameras if now_s - self.last_frame_s.get(name, -1e9) > limit_s
         )
 
+    def off(self) -> set[str]:
+        """The cameras whose processes report that they are switched off."""
+        return {name for name, health in self.health.items() if health.state == "off"}
+
     def why(self, camera: str) -> str:
         """Reason, in brackets, that a camera's process reports for missing frames; may be empty."""
         health = self.health.get(camera)

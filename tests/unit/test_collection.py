@@ -54,6 +54,12 @@ def test_several_cameras_are_named_in_the_plural() -> None:
     assert went_silent_words([], set()) == ""
 
 
+def test_sensors_that_were_switched_off_need_no_cable() -> None:
+    """A scan in which somebody switched them off sent the operator to all cables."""
+    assert "sensors were stopped during" in went_silent_words(["a", "b"], set(), {"a", "b"})
+    assert "check its cable" in went_silent_words(["a"], set(), {"b"})
+
+
 def _frame(camera: str, scale_m: float) -> LiveFrame:
     header = FrameHeader(camera, camera, 2, 2, scale_m, 0, 30.0, 0.0, 0.0, 0, 0)
     return LiveFrame(header, np.zeros((2, 2), np.uint16))

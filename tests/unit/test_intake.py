@@ -34,6 +34,19 @@ def booth(tmp_path: Path) -> Iterator[tuple[zmq.Socket[bytes], FrameIntake]]:
     context.destroy(linger=0)
 
 
+def test_a_sensor_that_is_switched_off_is_known(
+    booth: tuple[zmq.Socket[bytes], FrameIntake],
+) -> None:
+    out, intake = booth
+    assert intake.off() == set()
+    out.send_multipart([b"health/a", CameraHealth("a", "off", "", 0, 0, 0).pack()])
+    for _ in range(200):
+        list(intake.frames(0.05))
+        if intake.off():
+            break
+    assert intake.off() == {"a"}
+
+
 def _changed(**changes: object) -> bytes:
     packed: bytes = msgpack.packb({**msgpack.unpackb(_HEADER.pack()), **changes})
     return packed
