@@ -107,6 +107,34 @@ def test_a_person_whose_scan_is_cancelled_is_not_asked_for_another(console: Live
         expect(screen).to_have_attribute("data-screen", "guide")
 
 
+def test_a_countdown_that_ended_with_its_console_is_told(console: LiveConsole) -> None:
+    """The page and the person's screen said "Get ready" until somebody gave the scan up."""
+
+    def longer(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "countdown_s": 30})
+
+    with browser() as started:
+        context = tablet(started)
+        page = context.new_page()
+        page.route("**/api/v1/session", longer)
+        log_in(page, console)
+        person = context.new_page()
+        person.goto(f"{console.url}/person")
+        expect(person.locator("svg")).to_be_visible(timeout=LONG_MS)
+        open_view(page, console, "scan")
+        page.click("#go", timeout=LONG_MS)
+        expect(person.locator("body")).to_have_attribute(
+            "data-screen", "countdown", timeout=LONG_MS
+        )
+        for pid in console.station.pids("console"):
+            os.kill(pid, signal.SIGKILL)
+        verdict = page.locator("#verdict")
+        expect(verdict).to_contain_text("The console was restarted before", timeout=LONG_MS)
+        expect(page.locator("#again")).to_be_enabled(timeout=LONG_MS)
+        expect(person.locator("body")).to_have_attribute("data-screen", "guide", timeout=LONG_MS)
+    console.station.wait_until(console.answers, "the console answers")
+
+
 def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:
     with browser() as started:
         page = tablet(started).new_page()

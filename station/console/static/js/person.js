@@ -73,6 +73,8 @@ listen((kind, data) => {
     else if (data.state === 'failed') again();
   } else if (kind === 'calibration' && data.running && data.countdown_s) countdown(data.countdown_s);
   else if (kind === 'calibration' && !data.running) guide();
+  // A console that was started again counts no further; a scan that goes on tells of itself.
+  else if (kind === 'reset') guide();
 });
 connect();
 guide();

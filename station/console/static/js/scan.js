@@ -108,10 +108,14 @@ export async function scan(main, session) {
 
   async function ask() {
     if (!current) return;
+    const mine = current;
     try {
       const found = await get(`/scans/${current.scan_id}`);
       if (current && found.scan_id === current.scan_id) take(found);
-    } catch { /* asked again */ }
+    } catch (error) {
+      // The countdown was the console's, which has been started again; anything else is asked again.
+      if (error.status === 404 && mine === current && mine.state === 'countdown') take({ state: 'failed', reasons: [], unbegun: true });
+    }
   }
 
   function take(found, more = {}) {
@@ -190,6 +194,7 @@ export async function scan(main, session) {
         figure,
         h('div', {}, h('h2', {}, t(`scan.${cancelled ? 'cancelled' : look}`)), h('p', {}, done.label || t('result.noLabel')),
           done.reasons.length && !cancelled ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
+          done.unbegun ? h('p', {}, t('scan.unbegun')) : null,
           done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: took })))),
       h('div', { className: 'actions' },
         done.state === 'failed' || done.gone ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
