@@ -135,6 +135,20 @@ def test_a_countdown_that_ended_with_its_console_is_told(console: LiveConsole) -
     console.station.wait_until(console.answers, "the console answers")
 
 
+def test_a_view_that_is_slow_says_so(console: LiveConsole) -> None:
+    """The one before it stood there for seconds, with buttons that did nothing."""
+    held: list[Route] = []
+    with browser() as started:
+        page = tablet(started).new_page()
+        log_in(page, console)
+        expect(page.locator("h1")).to_have_text("Scan", timeout=LONG_MS)
+        page.route("**/api/v1/calibrations", lambda route: held.append(route), times=1)
+        open_view(page, console, "calibration")
+        expect(page.locator("main [role=status]")).to_have_text("One moment …", timeout=LONG_MS)
+        held[0].continue_()
+        expect(page.locator("h1")).to_have_text("Calibration", timeout=LONG_MS)
+
+
 def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:
     with browser() as started:
         page = tablet(started).new_page()

@@ -16,6 +16,8 @@ const VIEWS = {
   compare: () => import('./compare.js').then((module) => module.compare),
 };
 const RAIL = ['scan', 'booth', 'history', 'calibration'];
+// A view that is not drawn by then says so: the one before it hears nothing any more.
+const SLOW_MS = 700;
 const BELONGS = { result: 'history', compare: 'history' };
 
 const main = document.getElementById('main');
@@ -80,6 +82,9 @@ async function show({ again = false } = {}) {
     if (link.dataset.view === (BELONGS[view] ?? view)) link.setAttribute('aria-current', 'page');
     else link.removeAttribute('aria-current');
   }
+  const waiting = setTimeout(() => {
+    if (mine === turn) main.replaceChildren(h('p', { className: 'empty', role: 'status' }, t('loading')));
+  }, SLOW_MS);
   document.title = `${t(`${view === 'calibration' ? 'cal' : view}.title`)} – ${t('app.title')}`;
   try {
     const draw = await reached(VIEWS[view]());
@@ -87,9 +92,11 @@ async function show({ again = false } = {}) {
     const place = h('div');
     const left = await draw(place, { ...session, again }, ...rest.map(decodeURIComponent));
     if (mine !== turn) { left(); return; }
+    clearTimeout(waiting);
     main.replaceChildren(place);
     leave = left;
   } catch (error) {
+    clearTimeout(waiting);
     if (mine !== turn || error.kind === 'not-logged-in') return;
     failed = true;
     main.replaceChildren(h('div', { className: 'empty' }, h('h1', {}, t('error')), h('p', { role: 'alert' }, error.message)));
