@@ -22,7 +22,7 @@ from console_page import (
     tablet,
 )
 from live_console import LiveConsole
-from playwright.sync_api import Route, expect
+from playwright.sync_api import Page, Route, expect
 
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import UNFINISHED
@@ -147,6 +147,39 @@ def test_a_view_that_is_slow_says_so(console: LiveConsole) -> None:
         expect(page.locator("main [role=status]")).to_have_text("One moment …", timeout=LONG_MS)
         held[0].continue_()
         expect(page.locator("h1")).to_have_text("Calibration", timeout=LONG_MS)
+
+
+def test_a_narrow_screen_cuts_nothing_off(
+    console: LiveConsole, scans: list[dict[str, Any]]
+) -> None:
+    """Names of downloads were outside a telephone's screen, and so were dates and verdicts."""
+    with browser() as started:
+        page = tablet(started).new_page()
+        page.set_viewport_size({"width": 390, "height": 780})
+        log_in(page, console)
+        open_view(page, console, "booth")
+        _inside(page, ".camera .chip", ".camera")
+        open_view(page, console, "history")
+        _inside(page, "[data-scan] .chip, [data-scan] .danger", ".history")
+        open_view(page, console, f"result/{scans[0]['scan_id']}")
+        page.click("#download", timeout=LONG_MS)
+        _inside(page, "#downloads a", "#main")
+        page.keyboard.press("Escape")
+        expect(page.locator("#downloads")).to_be_hidden()
+        expect(page.locator("#download")).to_be_focused()
+
+
+def _inside(page: Page, parts: str, whole: str) -> None:
+    """No part is beyond the left or right of the whole that it is in."""
+    expect(page.locator(parts).first).to_be_visible(timeout=LONG_MS)
+    beyond = page.locator(parts).evaluate_all(
+        """(parts, whole) => parts.filter((part) => {
+          const [own, all] = [part, part.closest(whole)].map((one) => one.getBoundingClientRect());
+          return own.left < all.left || own.right > all.right;
+        }).map((part) => part.textContent)""",
+        whole,
+    )
+    assert beyond == []
 
 
 def test_a_command_in_a_message_is_named_as_its_button(console: LiveConsole) -> None:

@@ -124,7 +124,13 @@ export async function result(main, session, scanId) {
           h('table', {}, h('thead', {}, h('tr', {}, h('th', {}, t('result.name')), h('th', { className: 'number' }, t('result.value')),
             h('th', { className: 'number' }, t('result.interval')))), body, sides)))));
   const shut = (event) => { if (!event.target.closest('.menu')) { menu.hidden = true; opener.setAttribute('aria-expanded', 'false'); } };
+  const escape = (event) => {
+    if (event.key !== 'Escape' || menu.hidden) return;
+    shut({ target: document.body });
+    opener.focus();
+  };
   document.addEventListener('click', shut);
+  document.addEventListener('keydown', escape);
   await table.show();
   show3d();
   const leave = () => {
@@ -133,6 +139,7 @@ export async function result(main, session, scanId) {
     silence();
     table.close();
     document.removeEventListener('click', shut);
+    document.removeEventListener('keydown', escape);
     if (viewer) viewer.close();
   };
   const silence = emptyWhenGone(main, [scanId], leave);
