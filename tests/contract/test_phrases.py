@@ -193,7 +193,7 @@ SPOKEN = [
     "the ball hanging at 1.8 and 0.7 m",
     "cameras a, b went silent; check their cables; scan again",
     "a/INDEX.txt, line 3: its ticks are those of line 1; record again",
-    "kept, and not in use yet: the computation puts it into use",
+    "kept, and not in use yet: the solution puts it into use",
     "calibration 20261101T100000Z cannot be used: camera a was calibrated and is not in "
     "booth.toml; cameras b, c are in booth.toml and were not calibrated; put the sensors and "
     "booth.toml back as they were, or run station calibrate",
@@ -324,6 +324,16 @@ def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> No
     }
     said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
     assert said == list(texts.values())
+
+
+@pytest.mark.parametrize("step", ["floor", "ball", "stand", "depth", "solve"])
+def test_a_step_is_named_alike_on_its_button_and_while_it_runs(step: str) -> None:
+    """The computation was "Solution" as soon as it ran, and in Chinese another word, too."""
+    catalogue = json.loads((STATIC / "catalogue.json").read_text())
+    assert (
+        json.loads(PHRASES.read_text())[catalogue["en"][f"cal.{step}"]]
+        == (catalogue["zh"][f"cal.{step}"])
+    )
 
 
 def test_the_pages_own_words_exist_in_both_languages_and_are_used() -> None:

@@ -103,7 +103,7 @@ def run(config_path: Path, step: str, new: bool) -> None:
     except KeyboardInterrupt:
         raise CalibrationError(f"stopped; {procedure.kept(waved_anew)}") from None
     if alone:
-        guide.say(procedure.following("the computation puts it into use"))
+        guide.say(procedure.following("the solution puts it into use"))
 
 
 def unfinished(config: BoothConfig) -> tuple[str, list[str]]:
