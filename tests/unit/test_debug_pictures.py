@@ -85,7 +85,7 @@ def test_folders_that_cannot_be_made_are_refused_before_the_work(tmp_path: Path)
     places = (
         ("--out", "file/result", "cannot be written"),
         ("--out", "nowhere", "exists already"),
-        ("--out", "loop/result", "cannot be written"),
+        ("--out", "loop/result", "cannot be made"),
         # Root may write there, but nothing can be made.
         ("--out", "/proc/result", "cannot be written"),
         ("--debug", "file", "cannot be written"),

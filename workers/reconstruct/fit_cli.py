@@ -173,7 +173,9 @@ def _check_folders(out_folder: Path, debug_folder: Path | None) -> None:
     if debug_folder is not None:
         from workers.pictures.debug_pictures import has_pictures
 
-        if debug_folder.resolve().is_relative_to(out_folder.resolve()):
+        # Unlike Path.resolve, without an error where links run in a circle.
+        pictures, result = (os.path.realpath(folder) for folder in (debug_folder, out_folder))
+        if Path(pictures).is_relative_to(result):
             raise InputError(
                 f"{debug_folder} would lie in {out_folder}, which has to be new; name a folder "
                 "elsewhere with --debug"
