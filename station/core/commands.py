@@ -23,6 +23,8 @@ from station.core.errors import BoothError, InputError
 from station.core.service import has_log, set_up_caches
 from station.core.start.interrupts import loading
 
+COMPILING = "the reconstruction is being compiled, once on this machine: a minute or two"
+
 config_option = click.option(
     "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
 )

@@ -86,6 +86,14 @@ def test_a_killed_worker_costs_neither_a_try_nor_the_scan(tmp_path: Path) -> Non
     assert spool.recover(retries=2) == []
 
 
+def _given_up_at_the_next_end(spool: Spool) -> None:
+    claim = spool.claim()
+    assert claim is not None
+    claim.close()
+    assert spool.recover(retries=2) == []
+    assert spool.where("a") == "failed"
+
+
 def test_a_scan_that_ends_every_worker_is_given_up(tmp_path: Path) -> None:
     spool = Spool(tmp_path)
     _submit(spool, "a")
@@ -94,11 +102,7 @@ def test_a_scan_that_ends_every_worker_is_given_up(tmp_path: Path) -> None:
         assert claim is not None
         claim.close()
         assert spool.recover(retries=2) == ["a"]
-    claim = spool.claim()
-    assert claim is not None
-    claim.close()
-    assert spool.recover(retries=2) == []
-    assert spool.where("a") == "failed"
+    _given_up_at_the_next_end(spool)
     assert "the station ended" in failure_reason(spool.path("failed", "a"))
 
 
@@ -111,11 +115,7 @@ def test_a_disk_that_refuses_is_no_end_of_the_station(tmp_path: Path) -> None:
     assert claim is not None
     claim.release()
     assert spool.recover(retries=2) == ["a"]
-    claim = spool.claim()
-    assert claim is not None
-    claim.close()
-    assert spool.recover(retries=2) == []
-    assert spool.where("a") == "failed"
+    _given_up_at_the_next_end(spool)
 
 
 def test_a_scan_whose_jobs_crash_is_given_up_with_the_last_reason(tmp_path: Path) -> None:

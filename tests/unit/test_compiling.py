@@ -8,8 +8,9 @@ import numba
 import pytest
 from click.testing import CliRunner
 
+from station.core.commands import COMPILING
 from workers.reconstruct import job
-from workers.reconstruct.compiling import COMPILING, compilation_told
+from workers.reconstruct.compiling import compilation_told
 from workers.reconstruct.fit_cli import fit
 
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from numba.core import event
 
-COMPILING = "the reconstruction is being compiled, once on this machine: a minute or two"
-
 
 class _Listener(event.Listener):
     """Tells once that something is being compiled."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from station.core.commands import writable_folder
+from station.core.commands import COMPILING, writable_folder
 from station.core.errors import InputError
 from station.core.files import PRIVATE_FOLDER_MODE, publish_folder
 from workers.scape.fit.fit import Method
@@ -78,7 +78,7 @@ def fit(
         if source is not None and not source.exists():
             raise InputError(f"{source} does not exist")
     _check_folders(out_folder, debug_folder)
-    from workers.reconstruct.compiling import COMPILING, compilation_told
+    from workers.reconstruct.compiling import compilation_told
     from workers.reconstruct.job import reconstruct_bundle
 
     def tell_of_compilation() -> None:

@@ -14,7 +14,7 @@ import click
 from station.archive.tables import printed_table, read_measurements
 from station.booth.operator.asking import STARTS, command
 from station.booth.session import FINAL, ON_DISK, UNSURE
-from station.core.commands import Number, config_option
+from station.core.commands import COMPILING, Number, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
@@ -39,7 +39,6 @@ _WORDS = {
     "accepted": "scan accepted: the person may leave",
     "reconstructing": "reconstructing",
 }
-_COMPILING = "the reconstruction is being compiled, once on this machine: a minute or two"
 _CHANGING = (_WORDS["capturing"], _WORDS["reconstructing"])
 
 
@@ -147,7 +146,7 @@ def _follow(
                 words = "cancelled"
             if state == "reconstructing" and not told and _compiles(config):
                 told = True
-                line.show(_COMPILING)
+                line.show(COMPILING)
             line.show(words, changes=words.startswith(_CHANGING))
             if enough(state):
                 return session
