@@ -9,7 +9,8 @@ from pathlib import Path
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
-from station.archive.tables import FILES, Unit, csv_table, read_measurements
+from station.archive.tables import Unit, csv_table, read_measurements
+from station.core.words.tables import FILES
 from station.core.words.terms import Language
 
 MEDIA_TYPES = {

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from station.archive.surfaces import Array, aligned, distances, read_mesh
-from station.archive.tables import DIGITS, PER_METRE, Pose, Unit, read_measurements
+from station.archive.tables import DIGITS, PER_METRE, Unit, read_measurements
+from station.core.words.tables import Pose
 from station.core.words.terms import Language, plain_name, split_side
 
 

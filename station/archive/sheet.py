@@ -25,7 +25,6 @@ from station.archive.records import ScanRecord
 from station.archive.surfaces import read_mesh
 from station.archive.tables import (
     DIGITS,
-    Pose,
     Unit,
     mark_of,
     notes_on_marks,
@@ -33,6 +32,7 @@ from station.archive.tables import (
     rows,
     side_differences,
 )
+from station.core.words.tables import Pose
 from station.core.words.terms import Language, verdict_words
 
 _WIDTH, _HEIGHT = A4

@@ -10,14 +10,10 @@ from typing import Any, Literal
 from station.archive.records import ScanRecord
 from station.core.errors import FormatError
 from station.core.files import MAX_JSON_BYTES, read_bounded_json
+from station.core.words.tables import FILES, Pose, rounded_differences
 from station.core.words.terms import Language, plain_name, split_side, verdict_words
 
 Unit = Literal["cm", "in", "m"]
-Pose = Literal["as-scanned", "standard"]
-FILES: dict[Pose, str] = {
-    "as-scanned": "measurements.json",
-    "standard": "measurements-standard.json",
-}
 PER_METRE: dict[Unit, float] = {"m": 1.0, "cm": 100.0, "in": 1 / 0.0254}
 DIGITS: dict[Unit, int] = {"m": 4, "cm": 1, "in": 2}
 """Decimals of each unit; finer than any interval."""
@@ -130,28 +126,21 @@ def side_differences(
 ) -> list[dict[str, Any]]:
     """Left less right of each measurement with two sides, with its 95 % interval in a unit.
 
-    The difference is that of both rounded values, which stand beside it. `real` says that the
-    interval does not hold 0. Results of earlier versions have none.
+    `real` says that the interval does not hold 0. Results of earlier versions have none.
     """
+    per_metre, digits = PER_METRE[unit], DIGITS[unit]
     found = []
-    shown = {row["name"]: row["value"] for row in rows(document, unit, language)}
-    for entry in document.get("differences", ()):
-        low, high = entry["interval95_m"]
-        value, *ends = (
-            round(PER_METRE[unit] * length, DIGITS[unit])
-            for length in (entry["value_m"], low, high)
-        )
-        left, right = (shown.get(f"{entry['name']}_{side}") for side in ("left", "right"))
-        if left is not None and right is not None:
-            value = round(left - right, DIGITS[unit])
+    values = rounded_differences(document, per_metre, digits)
+    for entry, value in zip(document.get("differences") or (), values, strict=True):
+        low_m, high_m = entry["interval95_m"]
         found.append(
             {
                 "name": str(entry["name"]),
                 "words": plain_name(f"{entry['name']}_left", language, with_side=False),
                 "value": value,
-                "low": ends[0],
-                "high": ends[1],
-                "real": low > 0.0 or high < 0.0,
+                "low": round(per_metre * low_m, digits),
+                "high": round(per_metre * high_m, digits),
+                "real": low_m > 0.0 or high_m < 0.0,
             }
         )
     return found

@@ -16,10 +16,11 @@ from typing import IO, Any, Protocol
 
 from station.archive.records import ScanRecord
 from station.archive.smis import smis
-from station.archive.tables import FILES, csv_table, read_measurements, rows
+from station.archive.tables import csv_table, read_measurements, rows
 from station.core.config import DeliverConfig
 from station.core.errors import BoothError
 from station.core.files import fsync_file, fsync_folder
+from station.core.words.tables import FILES
 
 _TIMEOUT_S = 10.0
 _LINKS = ("mesh.glb", "mesh.obj", "preview.png", "avatar.glb")

@@ -24,9 +24,10 @@ import numpy as np
 from measured_scans import CONTENTS, POSES, Scan, Studio, accepted, row_errors
 from numpy.typing import NDArray
 
+from station.core.words.tables import Pose
 from workers.measure.body import Content, MeasuredBody, measure_body, measure_standing
 from workers.measure.definitions import DEFINITIONS
-from workers.measure.intervals import Pose, ScanErrors, write_shipped
+from workers.measure.intervals import ScanErrors, write_shipped
 from workers.reconstruct.job import warm_up
 from workers.scape.model.body_model import BodyModel
 

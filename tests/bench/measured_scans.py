@@ -16,12 +16,13 @@ from unlike_bodies import UnlikeBodies, UnlikeSplit
 from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
+from station.core.words.tables import Pose
 from station.simulation import violations
 from station.simulation.scene import Mesh, astray, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import measure_body
-from workers.measure.intervals import Pose, RowErrors, content_sigma, line_sigma, sides_pooled
+from workers.measure.intervals import RowErrors, content_sigma, line_sigma, sides_pooled
 from workers.measure.standing import standard_turns, stood_upright
 from workers.measure.tracing import trace_all
 from workers.scape.fit.fit import FitResult, fit_body

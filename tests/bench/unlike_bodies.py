@@ -19,8 +19,8 @@ from room import first_with_room
 from sculpting import Body, sculpted
 from true_measurements import TrueBody
 
+from station.core.words.tables import Pose
 from station.simulation.scene import Mesh
-from workers.measure.intervals import Pose
 from workers.measure.standing import on_both_feet, standard_turns
 from workers.scape.learn.database import PARTS, Shapes, body_database
 from workers.scape.model.body_model import BodyModel

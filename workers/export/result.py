@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from station import __version__
+from station.core.words.tables import FILES
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
 from workers.export.origin import Origin
@@ -27,7 +28,6 @@ from workers.scape.fit.fit import FitResult
 from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
 
-STANDARD_POSE_FILE = "measurements-standard.json"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 
 
@@ -84,7 +84,8 @@ def write_result(
             name: beside.submit(_stored, folder / name, content)
             for name, content in {**surface, "preview.png": picture}.items()
         }
-        for name, body in (("measurements.json", measured), (STANDARD_POSE_FILE, standing)):
+        for body in (measured, standing):
+            name = FILES[body.pose]
             table = _json(measurements_document(origin, body, fit.verdict))
             hashes[name] = beside.submit(_stored, folder / name, table)
     seconds = {**watch.seconds, "total": watch.total_s()}

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.words.tables import Pose
 from workers.measure.coverage import Basis, SeenSkin
-from workers.measure.intervals import Pose, ScanErrors, content_interval, intervals, row_values
+from workers.measure.intervals import ScanErrors, content_interval, intervals, row_values
 from workers.measure.kinds import Route, Top
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all

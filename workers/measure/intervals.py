@@ -27,18 +27,18 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from station.core.errors import FormatError
+from station.core.words.tables import Pose
 from workers.measure.kinds import Definition, Top
 from workers.measure.tracing import Trace
 
 Array = NDArray[np.float64]
-Pose = Literal["as-scanned", "standard"]
 
 FORMAT = "booth-intervals"
 VERSION = 2

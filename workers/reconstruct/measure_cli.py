@@ -14,6 +14,7 @@ from pydantic import BaseModel, FiniteFloat, ValidationError
 from station.core.commands import at_most_one
 from station.core.errors import FormatError, InputError
 from station.core.files import read_json
+from station.core.words.tables import FILES, Pose, rounded_differences
 from station.core.words.terms import plain_name
 
 _DIGITS = 5
@@ -28,7 +29,7 @@ _NAME_WIDTH = 34
 @click.option("--csv", "as_csv", is_flag=True, help="print CSV")
 @click.option(
     "--pose",
-    type=click.Choice(["as-scanned", "standard"]),
+    type=click.Choice(list(FILES)),
     default="as-scanned",
     show_default=True,
     help="as the person stood, or in the standard standing pose",
@@ -39,7 +40,7 @@ _NAME_WIDTH = 34
     default="z",
     help="a mesh's upward axis",
 )
-def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> None:
+def measure(source: Path, as_json: bool, as_csv: bool, pose: Pose, up: str) -> None:
     """Print the measurements of a result folder, or measure a mesh in the template's topology.
 
     A mesh (metres, soles on the floor) needs no fit; it counts as exact, so its intervals have no
@@ -64,8 +65,8 @@ def measure(source: Path, as_json: bool, as_csv: bool, pose: str, up: str) -> No
         _print_table(document)
 
 
-def _of_result(folder: Path, pose: str) -> dict[str, Any]:
-    name = "measurements.json" if pose == "as-scanned" else "measurements-standard.json"
+def _of_result(folder: Path, pose: Pose) -> dict[str, Any]:
+    name = FILES[pose]
     path = folder / name
     if not path.exists() and not path.is_symlink():
         mesh = folder / "mesh.ply"
@@ -131,7 +132,7 @@ class _Document(BaseModel):
     surface_m2: _Content | None = None
 
 
-def _of_mesh(path: Path, pose: str, up: str) -> dict[str, Any]:
+def _of_mesh(path: Path, pose: Pose, up: str) -> dict[str, Any]:
     from workers.cloud.cloud_file import read_template_mesh
     from workers.export.origin import Origin
     from workers.export.result import measurements_document
@@ -175,9 +176,8 @@ def _write_csv(document: dict[str, Any]) -> None:
         writer.writerow(
             [row["name"], *numbers, "m", row.get("basis") or "", row.get("standard") or ""]
         )
-    for row in document.get("differences") or ():
-        ends = (round(x, _DIGITS) for x in row["interval95_m"])
-        numbers = (_left_less_right(document, row, 1.0, _DIGITS), *ends)
+    for row, value in _differences(document, 1.0, _DIGITS):
+        numbers = (value, *(round(x, _DIGITS) for x in row["interval95_m"]))
         writer.writerow([f"{row['name']}_left_minus_right", *numbers, "m", "", ""])
     for name, unit, content in _contents(document):
         numbers = tuple(round(x, _DIGITS) for x in (content["value"], *content["interval95"]))
@@ -224,34 +224,28 @@ def _print_table(document: dict[str, Any]) -> None:
         click.echo(f"{_named(name)}{content['value']:7.4f} {unit}  {span}")
 
 
-def _left_less_right(
-    document: dict[str, Any], row: dict[str, Any], scale: float, digits: int
-) -> float:
-    """Difference of both sides' values as the table rounds them, beside which it stands."""
-    values = {found["name"]: found["value_m"] for found in document["measurements"]}
-    left, right = (values.get(f"{row['name']}_{side}") for side in ("left", "right"))
-    if left is None or right is None:
-        return round(scale * row["value_m"], digits)
-    return round(round(scale * left, digits) - round(scale * right, digits), digits)
+def _differences(
+    document: dict[str, Any], per_metre: float, digits: int
+) -> list[tuple[dict[str, Any], float]]:
+    """Differences between the sides, with their rounded values."""
+    values = rounded_differences(document, per_metre, digits)
+    return list(zip(document.get("differences") or (), values, strict=True))
 
 
 def _print_differences(document: dict[str, Any]) -> None:
     """Differences between the sides whose interval does not contain 0."""
     certain = [
-        row
-        for row in document.get("differences") or ()
+        (row, value)
+        for row, value in _differences(document, 100.0, 1)
         if (ends := row["interval95_m"])[0] < ends[1] and (ends[0] > 0.0 or ends[1] < 0.0)
     ]
     if certain:
         click.echo("Differences between left and right:")
-    for row in certain:
+    for row, value in certain:
         side = "left" if row["value_m"] > 0.0 else "right"
-        size, ends = (
-            abs(_left_less_right(document, row, 100.0, 1)),
-            sorted(map(abs, row["interval95_m"])),
-        )
+        ends = sorted(map(abs, row["interval95_m"]))
         click.echo(
-            f"{_named(row['name'])}{size:7.1f} cm  {100 * ends[0]:6.1f} to "
+            f"{_named(row['name'])}{abs(value):7.1f} cm  {100 * ends[0]:6.1f} to "
             f"{100 * ends[1]:5.1f}    larger on the {side}"
         )
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from station.booth.session import MAX_LABEL_LENGTH
+from station.core.words.tables import Pose
 
 State = Literal[
     "countdown", "armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"
@@ -186,7 +187,7 @@ class Measurements(BaseModel):
     label: str
     verdict: str
     created: str
-    pose: Literal["as-scanned", "standard"]
+    pose: Pose
     unit: Literal["cm", "in", "m"]
     rows: list[Row]
     differences: list[SideDifference]
@@ -227,7 +228,7 @@ class Comparison(BaseModel):
 
     first: Scan
     second: Scan
-    pose: Literal["as-scanned", "standard"]
+    pose: Pose
     unit: Literal["cm", "in", "m"]
     rows: list[ComparedRow]
     surface_rms_m: float

@@ -17,13 +17,14 @@ from station.archive.compare import compare_rows, compare_surfaces
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
-from station.archive.tables import Pose, Unit, csv_table, read_measurements, rows, side_differences
+from station.archive.tables import Unit, csv_table, read_measurements, rows, side_differences
 from station.console.api.console import Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
 from station.console.api.problems import ProblemError, responses
 from station.console.api.scans import of_record
 from station.core.errors import FormatError
 from station.core.files import MAX_JSON_BYTES, read_bounded_json
+from station.core.words.tables import Pose
 from station.core.words.terms import Language
 
 router = APIRouter(prefix="/scans/{scan_id}", tags=["results"])

@@ -1,1 +1,1 @@
-"""Words that the booth and its workers share: names of measurements."""
+"""Measurements as the booth and its workers tell them alike: names, and tables' common parts."""

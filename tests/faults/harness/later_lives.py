@@ -12,12 +12,12 @@ from pathlib import Path
 import lives
 
 from station.archive.index import ScanIndex
-from station.archive.tables import FILES
 from station.booth.deletion import purge_scans, traces
 from station.booth.retention import Deleted, expire_old
 from station.core.config import RetentionConfig
 from station.core.files import private_folder
 from station.core.spool import Claim, Spool
+from station.core.words.tables import FILES
 from station.handover.ledger import Ledger, Waiting
 from station.handover.targets import FolderTarget, HandOverError
 

@@ -20,8 +20,8 @@ import psutil
 from booth import Booth, Scans, running_booth, until, whole_booth
 from table import Row
 
-from station.archive.tables import FILES
 from station.core.files import private_folder
+from station.core.words.tables import FILES
 
 _WAITING = 500
 _ANSWER_S, _SHARE = 1.0, 0.5

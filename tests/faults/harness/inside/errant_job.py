@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from station.archive.tables import FILES
 from station.core.bundle import read_bundle
+from station.core.words.tables import FILES
 
 _ORDER = Path(os.environ["BOOTH_JOB_ORDER"])
 """File that holds "", "quick", "segfault", "loop", "memory" or "nan"; "quick" from the start."""
