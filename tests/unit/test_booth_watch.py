@@ -30,7 +30,7 @@ from station.booth.health import booth_health
 from station.booth.retention import Deleted
 from station.console.live import watch as watch_module
 from station.console.live.cameras import Pictures
-from station.console.live.control import NotRunningError, RefusedError
+from station.console.live.control import NotRunningError
 from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.console.live.tasks import Tasks
@@ -39,6 +39,7 @@ from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.scans import CANCELLED, ScanId, ScanNote, scan_id_of
 from station.core.spool import Spool
+from station.messaging.asking import RefusedError
 from station.messaging.messages import CameraHealth, FrameHeader
 from station.messaging.transport import publisher
 from station.simulation.scene import default_rig

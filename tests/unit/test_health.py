@@ -18,7 +18,7 @@ from sync_process import sync_of
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
-from station.booth.operator import asking, status_cli
+from station.booth.operator import status_cli
 from station.booth.scan_writer import booth_rig
 from station.calibration.drift.check_cli import check
 from station.calibration.guide.calibrate_cli import calibrate
@@ -30,6 +30,7 @@ from station.core.rig import Rig
 from station.core.scans import CANCELLED, scan_id_of
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.core.spool import Spool
+from station.messaging import asking
 from station.messaging.messages import Reply
 from station.sensors.freenect import FreenectCamera
 from station.sensors.identity import calibrated_serials

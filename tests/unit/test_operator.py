@@ -16,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from station.booth.operator import asking, scan_cli
+from station.booth.operator import scan_cli
 from station.booth.operator.scan_cli import _follow, scan, show_result
 from station.booth.operator.sensors_cli import cancel, start, stop
 from station.booth.operator.status_cli import status
@@ -26,6 +26,7 @@ from station.core.errors import BoothError, FormatError
 from station.core.files import held
 from station.core.scans import CANCELLED
 from station.core.service import HEALTH, STATION_LOCK
+from station.messaging import asking
 from station.messaging.messages import Reply, Request
 from station.messaging.transport import NoAnswerError, NothingRunsError
 

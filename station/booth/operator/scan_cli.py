@@ -12,7 +12,6 @@ from typing import Any
 import click
 
 from station.archive.tables import printed_table, read_measurements
-from station.booth.operator.asking import STARTS, command
 from station.booth.session import FINAL, ON_DISK, UNSURE
 from station.core.commands import COMPILING, Number, config_option
 from station.core.config import BoothConfig
@@ -22,6 +21,7 @@ from station.core.files import is_held
 from station.core.scans import CANCELLED, new_scan_id, scan_id_of
 from station.core.service import STATION_LOCK, read_health
 from station.core.words.terms import verdict_words
+from station.messaging.asking import STARTS, command
 from station.messaging.messages import Request
 from station.messaging.transport import NoAnswerError
 

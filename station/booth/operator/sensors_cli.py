@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from station.booth.operator.asking import command
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
+from station.messaging.asking import command
 from station.messaging.messages import Request
 from station.messaging.transport import NothingRunsError
 

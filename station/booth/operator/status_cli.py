@@ -19,11 +19,11 @@ from station.booth.health import (
     starting,
     unusable,
 )
-from station.booth.operator.asking import STARTS, command
 from station.core.commands import config_option
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError
 from station.core.service import NOTHING_RUNS
+from station.messaging.asking import STARTS, command
 from station.messaging.messages import Request
 
 _EXIT_NO_SCANS = 1

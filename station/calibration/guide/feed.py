@@ -28,10 +28,11 @@ from station.core.errors import CalibrationError
 from station.core.kinect_v1 import depth_of_raw
 from station.core.rig import CameraCalibration
 from station.core.service import die_with_parent
+from station.messaging.asking import RefusedError, command
 from station.messaging.intake import FrameIntake, LiveFrame
 from station.messaging.messages import DesiredState, Request
 from station.messaging.topics import TOPICS
-from station.messaging.transport import ask_again, publisher
+from station.messaging.transport import publisher
 from station.sensors.base import DeviceInfo
 from station.sensors.recording import read_raw
 
@@ -113,14 +114,10 @@ class Feed:
             CalibrationError: naming the cameras that give none, and why.
         """
         if not self._clocks:
-            answer = ask_again(
-                self._config.runtime.folder,
-                "control",
-                Request("start"),
-                self._config.runtime.command_timeout_s,
-            )
-            if not answer.ok:
-                raise CalibrationError(answer.error)
+            try:
+                command(self._config, Request("start"), repeats=True)
+            except RefusedError as refused:
+                raise CalibrationError(str(refused)) from None
         deadline_s = time.monotonic() + timeout_s
         while missing := [
             name

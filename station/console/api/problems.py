@@ -12,9 +12,10 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from station.archive.index import IndexBusyError
-from station.console.live.control import NotRunningError, RefusedError
+from station.console.live.control import NotRunningError
 from station.core.errors import BoothError
 from station.core.files import disk_words
+from station.messaging.asking import RefusedError
 
 MEDIA_TYPE = "application/problem+json"
 

@@ -27,8 +27,9 @@ from station.console.api.console import (
 )
 from station.console.api.models import NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
-from station.console.live.control import NotRunningError, RefusedError, command
+from station.console.live.control import NotRunningError, command
 from station.core.scans import boot_id, new_scan_id, plain_label, scan_id_of
+from station.messaging.asking import RefusedError
 from station.messaging.messages import Request
 
 router = APIRouter(prefix="/scans", tags=["scans"])

@@ -6,16 +6,12 @@ from typing import Any
 
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
+from station.messaging import asking
 from station.messaging.messages import Request
-from station.messaging.transport import ask
 
 
 class NotRunningError(BoothError):
     """No station is responding."""
-
-
-class RefusedError(BoothError):
-    """The station responds, and refuses."""
 
 
 def command(config: BoothConfig, request: Request) -> dict[str, Any]:
@@ -26,9 +22,8 @@ def command(config: BoothConfig, request: Request) -> dict[str, Any]:
         RefusedError: it refuses; the message says why and what to do.
     """
     try:
-        reply = ask(config.runtime.folder, "control", request, config.runtime.command_timeout_s)
+        return asking.command(config, request)
+    except asking.RefusedError:
+        raise
     except BoothError as error:
         raise NotRunningError(str(error)) from None
-    if not reply.ok:
-        raise RefusedError(reply.error)
-    return reply.content

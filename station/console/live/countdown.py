@@ -9,10 +9,11 @@ from typing import Any
 
 import zmq
 
-from station.console.live.control import NotRunningError, RefusedError, command
+from station.console.live.control import NotRunningError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
 from station.core.scans import CANCELLED
+from station.messaging.asking import RefusedError
 from station.messaging.messages import Request
 
 _KEPT = 100

@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from station.console.live.control import RefusedError
 from station.console.live.events import EventLog
 from station.core.service import die_with_parent
+from station.messaging.asking import RefusedError
 
 _LINES_KEPT = 60
 _COMPLAINT_BYTES = 1 << 16

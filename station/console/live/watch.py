@@ -16,13 +16,14 @@ from station.archive.compare import compare_surfaces
 from station.archive.index import ScanIndex
 from station.archive.records import PLACES, ScanRecord
 from station.booth.health import can_scan
-from station.console.live.control import NotRunningError, RefusedError, command
+from station.console.live.control import NotRunningError, command
 from station.console.live.events import EventLog
 from station.console.live.folders import FolderChanges
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
 from station.core.scans import ScanId
 from station.core.spool import Spool
+from station.messaging.asking import RefusedError
 from station.messaging.messages import CameraHealth, Request, ScanEvent
 from station.messaging.transport import endpoint, subscriber
 

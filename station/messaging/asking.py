@@ -12,6 +12,10 @@ from station.messaging.transport import ask, ask_again
 STARTS = "the booth is starting; try again in a few seconds"
 
 
+class RefusedError(BoothError):
+    """The station responds, and refuses."""
+
+
 def command(config: BoothConfig, request: Request, *, repeats: bool = False) -> dict[str, Any]:
     """Content of control's reply.
 
@@ -19,11 +23,12 @@ def command(config: BoothConfig, request: Request, *, repeats: bool = False) -> 
         repeats: the request may be received twice.
 
     Raises:
-        BoothError: control refused, or did not answer.
+        NoAnswerError: control did not answer.
+        RefusedError: it refuses; the message says why and what to do.
     """
     runtime = config.runtime
     asked = ask_again if repeats else ask
     reply = asked(runtime.folder, "control", request, runtime.command_timeout_s)
     if not reply.ok:
-        raise BoothError(reply.error)
+        raise RefusedError(reply.error)
     return reply.content
