@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.core.depth.numbers import number, shown, whole
+from station.core.depth.json_values import number, shown, text, whole
 from station.core.depth.png import image_of_png, png_of, png_size
 from station.core.errors import BundleError, CalibrationError, DiskReadError
 from station.core.files import OF_THE_DISK, private_folder, read_json, read_regular, write_json
@@ -131,10 +131,10 @@ def read_bundle(folder: Path) -> Bundle:
         spread_s_max = number("spread_s_max", _object("sync", document["sync"])["spread_s_max"])
         bundle = Bundle(
             folder=folder,
-            scan_id=_text("scan_id", document["scan_id"]),
-            created=_text("created", document["created"]),
-            label=_text("label", document.get("label", "")),
-            booth=_text("booth", document.get("booth", "")),
+            scan_id=text("scan_id", document["scan_id"]),
+            created=text("created", document["created"]),
+            label=text("label", document.get("label", "")),
+            booth=text("booth", document.get("booth", "")),
             depth_scale_m=scale,
             rig=rig,
             frames=frames,
@@ -166,13 +166,6 @@ def read_bundle(folder: Path) -> Bundle:
     return bundle
 
 
-def _text(name: str, found: object) -> str:
-    # Half of a UTF-16 pair: JSON may escape it, but no file of the result can hold it.
-    if not isinstance(found, str) or any("\ud800" <= c <= "\udfff" for c in found):
-        raise ValueError(f"{name} is not valid text")
-    return found
-
-
 def _object(name: str, found: object) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"{name} is {shown(found)}, not an object {{...}}")
@@ -188,7 +181,7 @@ def _records(camera: str, fields: object) -> tuple[FrameRecord, ...]:
 
 
 def _record(entry: Mapping[str, Any]) -> FrameRecord:
-    file = _text("the name of a frame's file", entry["file"])
+    file = text("the name of a frame's file", entry["file"])
     name = PurePosixPath(file)
     if name.is_absolute() or ".." in name.parts:
         raise ValueError(f"the frame file {file!a:.80} lies outside the bundle")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from station.core.depth.correction import DepthCorrection
 from station.core.depth.intrinsics import check_intrinsics
-from station.core.depth.numbers import array_of, number, shown
+from station.core.depth.json_values import array_of, number, text
 from station.core.errors import CalibrationError, FormatError
 from station.core.files import read_json, write_json
 from station.core.geometry import is_rigid
@@ -164,8 +164,8 @@ class Rig:
         document = read_json(path, format=FORMAT, versions=VERSIONS)
         try:
             rig = cls(
-                created=_text("created", document["created"]),
-                reference=_text("reference", document["reference"]),
+                created=text("created", document["created"]),
+                reference=text("reference", document["reference"]),
                 cameras=_cameras(document["cameras"]),
                 residual_rms_m=number("residual_rms_m", document["residual_rms_m"]),
                 predicted=(
@@ -194,12 +194,6 @@ class Rig:
 def _expect(met: bool | np.bool_, camera: str, words: str) -> None:
     if not met:
         raise ValueError(f"camera {camera}: {words}")
-
-
-def _text(name: str, found: object) -> str:
-    if not isinstance(found, str):
-        raise ValueError(f"{name} is {shown(found)}, not text")
-    return found
 
 
 def _cameras(found: object) -> dict[str, CameraCalibration]:
@@ -249,8 +243,8 @@ def _camera(name: str, fields: Mapping[str, Any]) -> CameraCalibration:
         raise ValueError(f"camera {name}: {cause}") from None
     return CameraCalibration(
         name=name,
-        serial=_text(f"camera {name}: serial", fields["serial"] or ""),
-        model=_text(f"camera {name}: model", fields["model"]),
+        serial=text(f"camera {name}: serial", fields["serial"] or ""),
+        model=text(f"camera {name}: model", fields["model"]),
         width=width,
         height=height,
         K=K,

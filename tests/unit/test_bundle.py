@@ -146,9 +146,9 @@ def test_a_bundle_cannot_reach_outside_its_folder(bundle_folder: Path) -> None:
         ({"cameras": ["front"]}, "cameras is a list, not an object"),
         ({"cameras": {"front": {"frames": {}}}}, "camera 'front': frames is an object"),
         ({"cameras": {"front": {"frames": ["000.png"]}}}, 'a frame is "000.png", not an object'),
-        ({"label": "order \ud800"}, "label is not valid text"),
-        ({"label": {"order": 7}}, "label is not valid text"),
-        ({"scan_id": 7}, "scan_id is not valid text"),
+        ({"label": "order \ud800"}, "label has characters that no file can hold"),
+        ({"label": {"order": 7}}, "label is an object {...}, not text"),
+        ({"scan_id": 7}, "scan_id is 7, not text"),
     ],
 )
 def test_contradictions_are_refused(
@@ -174,7 +174,7 @@ def test_parts_of_a_tick_are_left_out(bundle_folder: Path) -> None:
         ("sequence", True, "sequence is true, not a number"),
         ("sequence", 1.5, r"sequence is 1\.5, not a whole number"),
         ("host_time_s", "12", 'host_time_s is "12", not a number'),
-        ("file", None, "file is not valid text"),
+        ("file", None, "the name of a frame's file is null, not text"),
     ],
 )
 def test_a_frames_wrong_field_is_named(

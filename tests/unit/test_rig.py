@@ -162,6 +162,7 @@ def _named(name: str) -> Callable[[dict[str, Any]], None]:
         (_set(*_CAMERA, "K", value=_nested(900)), "camera front-upper: K must be (3, 3)"),
         (_set(*_CAMERA, "width", value=None), "front-upper: width and height must be whole"),
         (_set(*_CAMERA, "serial", value=7), "front-upper: serial is 7, not text"),
+        (_set(*_CAMERA, "model", value="\ud800"), "front-upper: model has characters that no file"),
         (_set(*_CAMERA, "depth_correction", value=None), "front-upper: depth_correction must be"),
         (
             _set(*_CAMERA, value={"serial": "A001"}),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.field import DepthField
-from station.core.depth.numbers import array_of
+from station.core.depth.json_values import array_of
 
 Array = NDArray[np.float64]
 

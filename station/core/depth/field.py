@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.depth.images import Image
-from station.core.depth.numbers import array_of
+from station.core.depth.json_values import array_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -1,4 +1,7 @@
-"""Numbers of a JSON document. Text, true and null are none, though Python takes them for some."""
+"""Values of a JSON document: numbers and text.
+
+Text, true and null are no numbers, though Python takes them for some.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +48,20 @@ def whole(name: str, found: object, *, parts: bool = False) -> int:
     if not (value.is_integer() or (parts and math.isfinite(value))):
         raise ValueError(f"{name} is {shown(found)}, not a whole number")
     return int(found)  # type: ignore[call-overload]  # it was looked at
+
+
+def text(name: str, found: object) -> str:
+    """The text of a field.
+
+    Raises:
+        ValueError: it is none; the message has the field's name.
+    """
+    if not isinstance(found, str):
+        raise ValueError(f"{name} is {shown(found)}, not text")
+    # Half of a UTF-16 pair: JSON may escape it, but no file of the result can hold it.
+    if any("\ud800" <= c <= "\udfff" for c in found):
+        raise ValueError(f"{name} has characters that no file can hold")
+    return found
 
 
 def array_of(found: object) -> Array | None:
