@@ -62,8 +62,8 @@ from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import reconstruct_bundle, warm_up
 from workers.scape.fit.fit import fit_body, sampling_of
 from workers.scape.fit.initial import starting_states
-from workers.scape.fit.seen_words import part_in_words
 from workers.scape.model.body_model import BodyModel
+from workers.scape.verdict.seen_words import part_in_words
 
 Array = NDArray[np.float64]
 

@@ -32,9 +32,9 @@ from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.reconstruct.job import warm_up
 from workers.scape.fit.fit import fit_body
-from workers.scape.fit.verdict import Verdict
 from workers.scape.learn.database import BodyDatabase
 from workers.scape.model.body_model import HAND, BodyModel
+from workers.scape.verdict.verdict import Verdict
 
 Array = NDArray[np.float64]
 

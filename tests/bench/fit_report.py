@@ -10,7 +10,7 @@ from fit_cases import Case
 from surface_errors import SurfaceErrors
 
 from workers.scape.fit.fit import FitResult
-from workers.scape.fit.seen_words import part_in_words
+from workers.scape.verdict.seen_words import part_in_words
 
 _LOST_MM = 15.0
 _PAPERS_SECONDS = 60.0

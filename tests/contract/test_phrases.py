@@ -18,12 +18,13 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.guide.steps import _rest_line, _wave_line
 from station.core.scans import CANCELLED
 from station.simulation.scene import default_rig
-from workers.scape.fit.seen_words import part_in_words
 from workers.scape.model.body_model import load_model
+from workers.scape.verdict.seen_words import part_in_words
 
 ROOT = Path(__file__).parents[2]
 SPEAKERS = (
-    "workers/scape/fit/verdict.py", "workers/scape/fit/seen_words.py",
+    "workers/scape/verdict/verdict.py", "workers/scape/verdict/seen_words.py",
+    "workers/scape/verdict/posture.py",
     "workers/cloud/preprocess.py", "workers/cloud/floor_level.py",
     "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",
@@ -61,9 +62,11 @@ NOT_SHOWN = re.compile(
     r"(sync|control) does not know the command|a (sync|control) process is already running|"
     r"default-src|a WebSocket|belongs to another user|the driver freenect needs|up or down|"
     r"there is nobody to hand|turning left|^scan %s|"
-    r"forward or back|waits for the disk|^yes or no$|^folder =|^7, but 7: 7$"
+    r"forward or back|waits for the disk|^yes or no$|^folder =|^7, but 7: 7$|"
+    r"down to the soles|floor of the cloud"
 )
-"""Sentences of programs to programs, or of `station run` and `station check` in their terminal."""
+"""Sentences of programs to programs, or in the terminal: of `station run`, `station check` and the
+fit of a bare cloud."""
 WORD = re.compile(r"(?<![\w./-])[a-z]{2,}(?![\w./-])")
 COMMANDS = re.compile(r"(sudo )?(station|systemctl) [a-z -]+|\(.*?\)")
 _SILENT_CALLS = ("log.", "_log.", "click.", "Field", "Query", "audit.note")

@@ -15,8 +15,8 @@ from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body, measure_standing
 from workers.reconstruct.measure_cli import measure
-from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
+from workers.scape.verdict.verdict import Verdict
 
 VERDICT = Verdict("rescan", ("the left arm is hidden",), (), ("hand_left", "forearm_left"))
 

@@ -23,7 +23,7 @@ from station.simulation.scene import default_rig
 from workers.export.stopwatch import Stopwatch
 from workers.measure.intervals import ScanErrors
 from workers.reconstruct import job
-from workers.scape.fit.unmatched import Patch
+from workers.scape.verdict.unmatched import Patch
 
 SAID = PredictedError(1e-3, 1.5e-3, 0.5e-3, 2e-4)
 RMS_M, SECONDS = 2e-3, 16

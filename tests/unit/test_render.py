@@ -15,8 +15,8 @@ from station.core.geometry import so3_exp
 from workers.export.preview import _label, _spread, preview, views_of
 from workers.measure.body import Measurement, measure_body
 from workers.pictures.render import BACKGROUND, Frame, Scene
-from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
+from workers.scape.verdict.verdict import Verdict
 
 OK = Verdict("ok", ())
 

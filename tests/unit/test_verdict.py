@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from workers.cloud.observed import RAISED_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.inside import shares_inside
-from workers.scape.fit.posture import arms_inside, feet_cut_off, head_turned, leaning
-from workers.scape.fit.unmatched import patch_sigma_m, unmatched_patches
-from workers.scape.fit.verdict import PartReport, judge, lost_parts
 from workers.scape.model.body_model import FLOOR, BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.verdict.posture import arms_inside, feet_cut_off, head_turned, leaning
+from workers.scape.verdict.seen import PartReport
+from workers.scape.verdict.unmatched import patch_sigma_m, unmatched_patches
+from workers.scape.verdict.verdict import judge, lost_parts
 
 Array = NDArray[np.float64]
 

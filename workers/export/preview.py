@@ -25,7 +25,7 @@ from workers.pictures.render import (
     text_width,
     write_text,
 )
-from workers.scape.fit.verdict import Verdict
+from workers.scape.verdict.verdict import Verdict
 
 Array = NDArray[np.float64]
 

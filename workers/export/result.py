@@ -25,8 +25,8 @@ from workers.export.stopwatch import Stopwatch
 from workers.measure.body import Content, MeasuredBody, Measurement
 from workers.measure.differences import side_differences
 from workers.scape.fit.fit import FitResult
-from workers.scape.fit.verdict import Verdict
 from workers.scape.model.body_model import BodyModel
+from workers.scape.verdict.verdict import Verdict
 
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "cholespy")
 

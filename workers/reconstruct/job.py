@@ -39,13 +39,13 @@ from workers.scape.fit.fit import (
     separate_limbs,
 )
 from workers.scape.fit.observer import Observer, unobserved
-from workers.scape.fit.unmatched import patch_sigma_m
 from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import BodyModel, load_model
 from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
 from workers.scape.surface.contours import warm_up as compile_contours
 from workers.scape.surface.uncertainty import hidden_head_sigma
+from workers.scape.verdict.unmatched import patch_sigma_m
 
 Progress = Callable[[str, float], None]
 """Called with the step's name and the share of it that is done, 0 to 1."""

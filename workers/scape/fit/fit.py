@@ -23,7 +23,14 @@ from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
 from workers.scape.fit.observer import Observer, unobserved
 from workers.scape.fit.paper import fit_like_the_paper
-from workers.scape.fit.posture import (
+from workers.scape.fit.sampling import Sampling
+from workers.scape.model.blas import single_threaded_blas
+from workers.scape.model.body_model import BodyModel, BodyState
+from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.halves import started
+from workers.scape.surface.displacement import SurfaceFit, fit_surface
+from workers.scape.surface.intersections import untangled
+from workers.scape.verdict.posture import (
     arms_inside,
     feet_cut_off,
     head_cut_off,
@@ -31,23 +38,9 @@ from workers.scape.fit.posture import (
     leaning,
     off_floor,
 )
-from workers.scape.fit.sampling import Sampling
-from workers.scape.fit.unmatched import Patch, unmatched_patches
-from workers.scape.fit.verdict import (
-    PartReport,
-    Verdict,
-    judge,
-    lost_parts,
-    report_parts,
-    sides_seen,
-    unexplained_share,
-)
-from workers.scape.model.blas import single_threaded_blas
-from workers.scape.model.body_model import BodyModel, BodyState
-from workers.scape.model.deformation import vertex_normals
-from workers.scape.model.halves import started
-from workers.scape.surface.displacement import SurfaceFit, fit_surface
-from workers.scape.surface.intersections import untangled
+from workers.scape.verdict.seen import PartReport, report_parts, sides_seen, unexplained_share
+from workers.scape.verdict.unmatched import Patch, unmatched_patches
+from workers.scape.verdict.verdict import Verdict, judge, lost_parts
 
 Array = NDArray[np.float64]
 Method = Literal["joint", "paper"]

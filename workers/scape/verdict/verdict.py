@@ -9,12 +9,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding, PointCloud
-from workers.scape.evidence.correspondence import OrientedTree
-from workers.scape.fit.seen_words import little_seen, many_hardly_seen, part_in_words
-from workers.scape.fit.unmatched import ELSEWHERE_M, Patch
+from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
-from workers.scape.model.deformation import vertex_areas, vertex_normals
+from workers.scape.verdict.seen import TRUNK, PartReport, named_parts
+from workers.scape.verdict.seen_words import little_seen, many_hardly_seen, part_in_words
+from workers.scape.verdict.unmatched import ELSEWHERE_M, Patch
 
 Array = NDArray[np.float64]
 
@@ -35,8 +34,6 @@ _MISMATCH_M = 0.005
 again anyhow: parts in their places have up to 4.2 mm, a third of those 5 cm off more than 5."""
 _PARTS_NAMED = 6
 """Parts that the reasons name at most."""
-_UNEXPLAINED_M = 0.03
-"""Distance from the surface beyond which a point does not belong to the body."""
 _CAMERA_SHIFTS_M = (0.002, 0.004)
 """Corrections of a camera from which it is remarked, and from which the scan cannot be used.
 Well-placed cameras are moved by tenths of a millimetre, one that is 5 mm off its calibration by
@@ -46,17 +43,6 @@ _STATURES_M = (1.30, 2.25)
 _MAX_BETA = 6.0
 """Largest shape coefficient of the first components, in standard deviations of people."""
 _JUDGED_COMPONENTS = 10
-_POINTS_FOR_PARTS, _POINTS_FOR_STARTS = 10_000, 5000
-"""Points used for the report on parts, and for the comparison of starts."""
-_TRUNK = ("pelvis", "abdomen", "chest")
-_SIDES = {
-    "front": ((0.0, -1.0, 0.0), 0.7),
-    "back": ((0.0, 1.0, 0.0), 0.7),
-    "left side": ((1.0, 0.0, 0.0), 0.2),
-    "right side": ((-1.0, 0.0, 0.0), 0.2),
-}
-"""Directions of the template's sides, which faces -y, and the least cosine between them and a
-side's normals. Flanks hide behind arms, so what faces them less counts too."""
 _OTHER_SIDE = 0.75
 """Share of the left side's coverage that the right side has at least, and the other way round: of
 half a body alone it has 0.05 to 0.6, of sound scans 0.91 to 1."""
@@ -72,17 +58,6 @@ sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm of
 _NO_BODY = "too much of the scan does not match a body: nothing can be measured"
 _ON_ITS_HEAD = "if the cloud stands on its head, say which axis points up (--up)"
 _NONE: Mapping[str, str] = MappingProxyType({})
-
-
-@dataclass(frozen=True, slots=True)
-class PartReport:
-    """Coverage and residuals of one part of the body."""
-
-    name: str
-    coverage: float
-    """Share of the part's area that cameras saw."""
-    residual_rms_m: float
-    """Rms distance of the part's points to the surface; NaN where it has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,75 +82,6 @@ class Verdict:
             if stem == "hand":
                 names.update(f"{member}_{side}" for member in HAND)
         return frozenset(names)
-
-
-def report_parts(
-    model: BodyModel, vertices: Array, seen: NDArray[np.bool_], cloud: PointCloud
-) -> tuple[tuple[PartReport, ...], float]:
-    """Reports on all parts, and the point-to-surface rms in metres.
-
-    Args:
-        vertices: (P, 3), the fitted surface.
-        seen: (P,), vertices with points.
-    """
-    areas = vertex_areas(vertices, model.faces)
-    normals = vertex_normals(vertices, model.faces)
-    points, directions = _thinned(cloud, _POINTS_FOR_PARTS)
-    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
-    offsets = points - vertices[vertex]
-    away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
-    unexplained = np.linalg.norm(offsets, axis=1) > _UNEXPLAINED_M
-    part = model.part_of_vertex
-    reports = []
-    for name, members in _groups(model).items():
-        mine = np.isin(part, members)
-        if not mine.any():
-            continue
-        own = np.isin(part[vertex], members) & ~unexplained
-        rms = float(np.sqrt(np.mean(away[own] ** 2))) if own.any() else float("nan")
-        coverage = float(areas[mine & seen].sum() / areas[mine].sum())
-        reports.append(PartReport(name, coverage, rms))
-    rms = float(np.sqrt(np.mean(away[~unexplained] ** 2))) if (~unexplained).any() else 1.0
-    return tuple(reports), rms
-
-
-def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> dict[str, float]:
-    """Shares of the trunk's front, back, left and right side that cameras saw.
-
-    Coverage by part does not show that one side is missing: half of each part is then still seen.
-    """
-    areas = vertex_areas(vertices, model.faces)
-    normals = vertex_normals(model.mean, model.faces)
-    trunk = model.of_parts(_TRUNK)
-    shares = {}
-    for side, (direction, least_cosine) in _SIDES.items():
-        there = trunk & (normals @ direction > least_cosine)
-        shares[side] = float(areas[there & seen].sum() / max(areas[there].sum(), 1e-12))
-    return shares
-
-
-def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> float:
-    """Share of the points farther than 3 cm from the surface: a lost limb, a second person."""
-    points, directions = _thinned(cloud, _POINTS_FOR_STARTS)
-    normals = vertex_normals(vertices, model.faces)
-    vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
-    away = np.linalg.norm(points - vertices[vertex], axis=1)
-    return float(np.mean(away > _UNEXPLAINED_M))
-
-
-def _thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
-    every = slice(None, None, max(1, len(cloud.points) // count))
-    return cloud.points[every], cloud.normals[every]
-
-
-def _groups(model: BodyModel) -> dict[str, list[int]]:
-    """Parts by the operator's names: hand, thumb and fingers are one part, the hand."""
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(model.part_names):
-        stem, _, side = name.rpartition("_")
-        key = f"hand_{side}" if stem in HAND else name
-        groups.setdefault(key, []).append(index)
-    return groups
 
 
 def judge(
@@ -228,23 +134,17 @@ def judge(
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if cameras else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
-    missing = [*(name for name in lost if name), *unseen]
-    if reasons:
-        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
-    missing = _with_rest_of_limbs(missing, lost, parts)
-    if not cameras and not _FEET.isdisjoint(missing):
-        # Only feet show where the floor of a bare cloud is; legs without them were pressed to it.
-        missing += [FLOOR, *(part for limb in _limbs() if limb[-1] in _FEET for part in limb[1:])]
-    missing += [FLOOR for finding in findings if finding.code in OFF_FLOOR]
-    if everywhere:
-        missing += [part.name for part in parts]
-    elif halves or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
-        missing += [
-            part.name for part in parts if part.name in _TRUNK or part.coverage < _HALF_COVERAGE
-        ]
-    return Verdict(
-        "rescan" if reasons else "ok", tuple(reasons), tuple(notes), tuple(dict.fromkeys(missing))
+    missing = _missing(
+        parts,
+        findings,
+        lost,
+        unseen,
+        cameras=cameras,
+        again=bool(reasons),
+        half=bool(halves),
+        everywhere=everywhere,
     )
+    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes), missing)
 
 
 def _stature_of_nobody(stature_m: float) -> list[str]:
@@ -295,7 +195,7 @@ def _moved_cameras(shifts_m: Mapping[str, float]) -> tuple[list[str], list[str]]
 
 def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
     """Reasons by the part that a large patch of the scan belongs to; "" where it is none."""
-    keys = {index: key for key, members in _groups(model).items() for index in members}
+    keys = {index: key for key, members in named_parts(model).items() for index in members}
     reasons: dict[str, str] = {}
     for patch in patches:
         if patch.area_m2 < _LOST_PATCH_M2:
@@ -326,6 +226,43 @@ def _limbs() -> list[list[str]]:
 def _limbs_lost(lost: Mapping[str, str]) -> int:
     """Number of limbs that do not match the scan: with two, a body was fitted to something else."""
     return sum(not lost.keys().isdisjoint(limb) for limb in _limbs())
+
+
+def _missing(
+    parts: Sequence[PartReport],
+    findings: Sequence[Finding],
+    lost: Mapping[str, str],
+    unseen: Mapping[str, str],
+    *,
+    cameras: bool,
+    again: bool,
+    half: bool,
+    everywhere: bool,
+) -> tuple[str, ...]:
+    """Parts, and the floor, where nothing can be measured.
+
+    Args:
+        lost: reasons by the part that does not match the scan or was misplaced.
+        unseen: what `_unseen_parts` gives.
+        again: the scan is to be taken again.
+        half: a side of the person was not seen.
+        everywhere: the body was fitted to something else.
+    """
+    missing = [*(name for name in lost if name), *unseen]
+    if again:
+        missing += [part.name for part in parts if part.residual_rms_m > _MISMATCH_M]
+    missing = _with_rest_of_limbs(missing, lost, parts)
+    if not cameras and not _FEET.isdisjoint(missing):
+        # Only feet show where the floor of a bare cloud is; legs without them were pressed to it.
+        missing += [FLOOR, *(part for limb in _limbs() if limb[-1] in _FEET for part in limb[1:])]
+    missing += [FLOOR for finding in findings if finding.code in OFF_FLOOR]
+    if everywhere:
+        missing += [part.name for part in parts]
+    elif half or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
+        missing += [
+            part.name for part in parts if part.name in TRUNK or part.coverage < _HALF_COVERAGE
+        ]
+    return tuple(dict.fromkeys(missing))
 
 
 def _with_rest_of_limbs(
