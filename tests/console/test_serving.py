@@ -8,7 +8,6 @@ import socket
 import ssl
 import subprocess
 import threading
-import time
 from pathlib import Path
 
 import httpx
@@ -16,6 +15,7 @@ import pytest
 from ctrl_c import heard
 from live_console import API, free_port
 from running_station import STATION
+from waiting import wait_until
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
@@ -46,8 +46,9 @@ def test_a_console_whose_port_is_taken_says_so_and_waits(tmp_path: Path) -> None
             target=lambda: got.append(_awaited_listener(console, console.log, stop))
         )
         waiting.start()
-        while not (told := read_health(console.config.runtime.folder, "console")):
-            time.sleep(0.05)
+        runtime = console.config.runtime.folder
+        wait_until(lambda: read_health(runtime, "console"), "the console's report")
+        told = read_health(runtime, "console")
         assert told["problems"][0].startswith(f"the console cannot listen at 127.0.0.1:{port} (")
     waiting.join(60.0)
     [listener] = got

@@ -88,7 +88,9 @@ def test_a_refused_check_may_be_asked_for_again(tmp_path: Path) -> None:
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             begun = await client.post(f"{API}/calibration", json={"step": "floor"})
             refused = await client.post(f"{API}/booth/check", headers=headers)
+            deadline_s = time.monotonic() + 60.0
             while (await client.get(f"{API}/task")).json()["running"]:
+                assert time.monotonic() < deadline_s
                 await asyncio.sleep(0.1)
             return [begun, refused, await client.post(f"{API}/booth/check", headers=headers)]
 

@@ -68,7 +68,9 @@ def test_a_camera_that_is_tried_again_keeps_its_reason(tmp_path: Path) -> None:
     capture = subprocess.Popen([*STATION, "capture", "a", "--config", str(path)])
     told: list[tuple[str, bool]] = []
     try:
+        deadline_s = time.monotonic() + 60.0
         while told.count(("lost", True)) < 12:
+            assert time.monotonic() < deadline_s
             wishes.send_multipart([b"desired", DesiredState(True).pack()])
             while reports.poll(100):
                 health = CameraHealth.unpack(reports.recv_multipart()[-1])
@@ -188,7 +190,9 @@ def test_a_recording_that_starts_over_loses_no_frames(booth: Path, tmp_path: Pat
     driver.open()
     try:
         sequences: list[int] = []
+        deadline_s = time.monotonic() + 60.0
         while len(sequences) < 60:
+            assert time.monotonic() < deadline_s
             frame = driver.read(1.0)
             sequences += [frame.sequence] if frame else []
     finally:

@@ -7,12 +7,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ctrl_c import heard
+from waiting import wait_until
 
 from station.calibration.detect.step_names import BALL, EMPTY, MARK
 from station.calibration.guide.session import JOURNAL, Session
@@ -64,6 +64,13 @@ def _run(config: Path, recordings: Path, *words: str) -> subprocess.CompletedPro
     )  # fmt: skip
 
 
+def _wait_for_the_ball(journal: Path) -> None:
+    """Wait until the ball was seen."""
+    wait_until(
+        lambda: journal.exists() and '"step":"ball"' in journal.read_text(), "the ball", 120.0
+    )
+
+
 def test_killed_while_the_ball_is_waved(config: Path, recordings: Path) -> None:
     """kill -9: what was seen up to a second before is there, and the next run adds to it."""
     folder = config.parent / "calibrations/unfinished"
@@ -73,11 +80,8 @@ def test_killed_while_the_ball_is_waved(config: Path, recordings: Path) -> None:
     waving = subprocess.Popen(
         _command(config, recordings, "ball"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    deadline_s = time.monotonic() + 60.0
-    while '"step":"ball"' not in (folder / JOURNAL).read_text():
-        assert time.monotonic() < deadline_s
-        assert waving.poll() is None
-        time.sleep(0.05)
+    _wait_for_the_ball(folder / JOURNAL)
+    assert waving.poll() is None
     os.kill(waving.pid, signal.SIGKILL)
     waving.wait()
     seen = len(Session.load(folder).balls)
@@ -104,12 +108,8 @@ def test_stopped_while_the_ball_is_waved(config: Path, recordings: Path) -> None
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         preexec_fn=heard,
     )  # fmt: skip
-    deadline_s = time.monotonic() + 120.0
-    journal = folder / JOURNAL
-    while not journal.exists() or '"step":"ball"' not in journal.read_text():
-        assert time.monotonic() < deadline_s
-        assert waving.poll() is None
-        time.sleep(0.05)
+    _wait_for_the_ball(folder / JOURNAL)
+    assert waving.poll() is None
     waving.send_signal(signal.SIGINT)
     told = waving.communicate(timeout=30)[0]
     assert waving.returncode == -signal.SIGINT, told

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
@@ -74,9 +74,7 @@ def test_a_job_that_is_compiled_first_says_so(
     process.send(tmp_path, tmp_path, config)
     with ThreadPoolExecutor(1) as beside:
         ending = beside.submit(process.outcome, 100.0, threading.Event(), lambda: None)
-        while not process.compiling:
-            assert not ending.done()
-            time.sleep(0.01)
+        wait_until(lambda: process.compiling or ending.done(), "compiling")
         compiled.touch()
         assert ending.result() == Outcome(status="ok")
     assert not process.compiling
@@ -128,10 +126,7 @@ def test_a_process_that_cannot_start_costs_no_scan(
     stop = threading.Event()
     worker = pool.Worker(config, spool, stop, logging.getLogger("workers"))
     monkeypatch.setattr(worker, "_trouble", started)
-    deadline_s = time.monotonic() + 60.0
-    while starts < config.workers.retries + 2:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
+    wait_until(lambda: starts >= config.workers.retries + 2, "tries")
     stop.set()
     worker.thread.join()
     assert (spool.waiting(), spool.scans_in("failed")) == (["a"], [])

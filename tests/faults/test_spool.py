@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from waiting import wait_until
 
 from station.core.errors import SpoolError
 from station.core.scans import ScanId, ScanNote, failure_reason
@@ -65,8 +66,7 @@ def _kill_a_worker(folder: Path, step: str) -> None:
         target=_claim_and_hang, args=(folder, step)
     )
     worker.start()
-    while not (folder / "ready").exists():
-        time.sleep(0.01)
+    wait_until((folder / "ready").exists, "a claim")
     assert worker.pid is not None
     os.kill(worker.pid, signal.SIGKILL)
     worker.join()

@@ -19,6 +19,7 @@ import numpy as np
 import open3d
 import pytest
 import zmq
+from waiting import wait_until
 
 from station.archive import index
 from station.archive.compare import compare_surfaces
@@ -43,13 +44,6 @@ from station.messaging.asking import RefusedError
 from station.messaging.messages import CameraHealth, FrameHeader
 from station.messaging.transport import publisher
 from station.simulation.scene import default_rig
-
-
-def _until(true: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -105,7 +99,7 @@ def test_a_cancelled_scan_does_not_count_as_failed(
         booth = watching.booth()
         return booth["failed"], booth["cancelled"], booth["spool"]["failed"]
 
-    _until(lambda: counts() == (1, 1, 2))
+    wait_until(lambda: counts() == (1, 1, 2))
 
 
 @pytest.mark.parametrize(
@@ -144,13 +138,13 @@ def test_no_distances_of_a_deleted_body_are_kept(watch: tuple[Watch, EventLog]) 
     spool = Spool(watching._config.spool.folder)
     first, second = (_small_body(spool.path("outbox", name)) for name in ("a", "b"))
     time.sleep(1.5)  # the watch looks again at folders that have just changed
-    _until(
+    wait_until(
         lambda: (
             compare_surfaces(first, second).rms_m < 1e-6 and compare_surfaces.cache_info().hits > 0
         )
     )
     purge_scans(spool, ["a"], Deleted())
-    _until(lambda: compare_surfaces.cache_info().currsize == 0)
+    wait_until(lambda: compare_surfaces.cache_info().currsize == 0)
 
 
 def test_a_clock_that_was_put_back_lets_the_watch_rest(
@@ -194,7 +188,7 @@ def test_a_result_that_is_taken_away_is_not_said_to_be_deleted(
     for scan_id in (ScanId("a"), ScanId("b")):
         spool.path("outbox", scan_id).mkdir()
         spool.notes.write(ScanNote(scan_id, "delivered"), durable=False)
-    _until(lambda: set(watching._seen or {}) == {"a", "b"})
+    wait_until(lambda: set(watching._seen or {}) == {"a", "b"})
     spool.path("outbox", "a").rmdir()
     purge_scans(spool, ["b"], Deleted())
 
@@ -202,7 +196,7 @@ def test_a_result_that_is_taken_away_is_not_said_to_be_deleted(
         scans = [json.loads(event.data) for event in events.after(0) if event.kind == "scan"]
         return {scan["scan_id"]: scan["state"] for scan in scans}
 
-    _until(lambda: told() == {"a": "taken", "b": "deleted"})
+    wait_until(lambda: told() == {"a": "taken", "b": "deleted"})
 
 
 def test_what_status_says_is_said_by_the_console(
@@ -223,23 +217,23 @@ def test_what_status_says_is_said_by_the_console(
 
     words = "the booth is not calibrated, and takes no scans: run station calibrate"
     monkeypatch.setattr(watch_module, "command", answered([words]))
-    _until(lambda: booth() == ([words], False))
+    wait_until(lambda: booth() == ([words], False))
     default_rig().save(watching._config.calibration)
     [camera] = watching._config.cameras
     cameras = [camera.model_copy(update={"name": name}) for name in default_rig().cameras]
     config = watching._config.model_copy(update={"cameras": cameras})
     monkeypatch.setattr(watching, "_config", config)
     monkeypatch.setattr(watch_module, "command", answered([]))
-    _until(lambda: booth() == ([], True))
+    wait_until(lambda: booth() == ([], True))
     monkeypatch.setattr(watch_module, "command", answered(["camera a: torn"], silent=["a"]))
-    _until(lambda: booth() == (["camera a: torn"], False))
+    wait_until(lambda: booth() == (["camera a: torn"], False))
     assert watching.booth()["compiling"]
 
     def silent(*_: object) -> None:
         raise NotRunningError("nothing runs")
 
     monkeypatch.setattr(watch_module, "command", silent)
-    _until(lambda: booth() == ([], False) and not watching.booth()["compiling"])
+    wait_until(lambda: booth() == ([], False) and not watching.booth()["compiling"])
 
 
 def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> None:
@@ -253,8 +247,8 @@ def test_the_death_of_a_camera_is_told_once(watch: tuple[Watch, EventLog]) -> No
         socket.send_multipart([b"health", health.pack()])
         return "streaming" in _states(events)
 
-    _until(reports)
-    _until(lambda: _states(events)[-1] == "dead")
+    wait_until(reports)
+    wait_until(lambda: _states(events)[-1] == "dead")
     context.destroy(linger=0)
     time.sleep(2.0)
     assert _states(events) == ["streaming", "dead"]
@@ -272,13 +266,13 @@ def test_a_height_is_answered_by_a_number(tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="nothing is waiting"):
         tasks.answer("1.7")
     tasks._begin("calibrate", "stand", [sys.executable, "-c", _ASKS])
-    _until(lambda: bool(tasks.state()["waits_for"]))
+    wait_until(lambda: bool(tasks.state()["waits_for"]))
     assert tasks.state()["question"] == "how high?"
     for word in ("go", "yes"):
         with pytest.raises(RefusedError, match="no answer"):
             tasks.answer(word)
     tasks.answer("1.7")
-    _until(lambda: not tasks.state()["running"])
+    wait_until(lambda: not tasks.state()["running"])
     assert tasks.state()["lines"] == ["1.7"]
 
 
@@ -296,11 +290,11 @@ say(kind="done", text="the ball at rest is seen by front-lower")
 def test_what_a_step_complained_of_is_not_said_of_the_next(tmp_path: Path) -> None:
     tasks = Tasks(tmp_path / "booth.toml", EventLog())
     tasks._begin("calibrate", "all", [sys.executable, "-c", _TWO_STEPS])
-    _until(lambda: bool(tasks.state()["waits_for"]))
+    wait_until(lambda: bool(tasks.state()["waits_for"]))
     assert tasks.state()["lines"] == ["more positions would help"]
     assert tasks.state()["step_lines"] == 0
     tasks.answer("go")
-    _until(lambda: not tasks.state()["running"])
+    wait_until(lambda: not tasks.state()["running"])
     assert (len(tasks.state()["lines"]), tasks.state()["step_lines"]) == (2, 1)
 
 
@@ -310,9 +304,9 @@ def test_a_task_outlives_the_thread_of_its_request(tmp_path: Path) -> None:
     request = threading.Thread(target=lambda: tasks._begin("calibrate", "stand", command))
     request.start()
     request.join()
-    _until(lambda: bool(tasks.state()["waits_for"]))
+    wait_until(lambda: bool(tasks.state()["waits_for"]))
     tasks.answer("1.7")
-    _until(lambda: not tasks.state()["running"])
+    wait_until(lambda: not tasks.state()["running"])
     assert tasks.state()["lines"] == ["1.7"]
 
 
@@ -321,7 +315,7 @@ def test_a_task_that_complains_at_length_ends(tmp_path: Path) -> None:
     script = "import sys; sys.stderr.write(100_000 * 'oh, ' + '\\nerror: no ball\\n'); sys.exit(1)"
     tasks = Tasks(tmp_path / "booth.toml", EventLog())
     tasks._begin("calibrate", "ball", [sys.executable, "-c", script])
-    _until(lambda: not tasks.state()["running"])
+    wait_until(lambda: not tasks.state()["running"])
     assert tasks.state()["error"] == "no ball"
 
 
@@ -331,7 +325,7 @@ def test_bytes_that_are_no_text_end_no_task(tmp_path: Path) -> None:
     tasks = Tasks(tmp_path / "booth.toml", EventLog())
     for _ in range(2):
         tasks._begin("calibrate", "ball", [sys.executable, "-c", script])
-        _until(lambda: not tasks.state()["running"])
+        wait_until(lambda: not tasks.state()["running"])
 
 
 def test_an_answer_to_a_task_that_has_just_died_is_refused(tmp_path: Path) -> None:
@@ -339,10 +333,10 @@ def test_an_answer_to_a_task_that_has_just_died_is_refused(tmp_path: Path) -> No
     hangs = "import os, time; os.close(0); time.sleep(60)"
     tasks = Tasks(tmp_path / "booth.toml", EventLog())
     tasks._begin("calibrate", "stand", [sys.executable, "-c", script + hangs])
-    _until(lambda: bool(tasks.state()["waits_for"]))
-    _until(lambda: _refuses(tasks))
+    wait_until(lambda: bool(tasks.state()["waits_for"]))
+    wait_until(lambda: _refuses(tasks))
     tasks.close()
-    _until(lambda: not tasks.state()["running"])
+    wait_until(lambda: not tasks.state()["running"])
 
 
 def _refuses(tasks: Tasks) -> bool:
@@ -377,7 +371,7 @@ def test_a_bad_frame_is_not_told_again_when_nobody_looks(
     asyncio.run(leave())
     pictures.start()
     try:
-        _until(lambda: "depth pictures: torn" in caplog.text)
+        wait_until(lambda: "depth pictures: torn" in caplog.text)
         assert not pictures._wanted.is_set()
     finally:
         pictures.close()

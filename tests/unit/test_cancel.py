@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 from sync_process import sync_of
+from waiting import wait_until
 
 from station.booth import control as control_module
 from station.booth.collection import Order
 from station.booth.control import ControlProcess
+from station.booth.sync import SyncProcess
 from station.core.config import BoothConfig
 from station.core.scans import CANCELLED, ScanNote, boot_id, scan_id_of
 from station.core.spool import Spool
@@ -48,16 +50,21 @@ def test_a_cancel_that_overtakes_its_order_cancels_it(one_camera: BoothConfig, l
         assert not sync._reply(Request("cancel", scan_id)).ok
         assert sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
         assert sync._reply(Request("scan", scan_id, valid_until_s=comes_s)).ok
-        while (note := notes.read(scan_id)) is None or note.stage == "armed":
-            time.sleep(0.05)
-        assert (note.stage, note.reason) == ("failed", CANCELLED)
         # The writer tells of it a moment after the note.
-        while sync._cancelled:
-            for event in sync._writer.events():
-                sync._handle(event)
+        wait_until(lambda: _told(sync), "the end of the scan")
+        note = notes.read(scan_id)
+        assert note is not None
+        assert (note.stage, note.reason) == ("failed", CANCELLED)
         # It has ended: no order of it comes.
         assert not sync._reply(Request("cancel", scan_id, valid_until_s=later_s)).ok
         assert sync._cancelled == set()
+
+
+def _told(sync: SyncProcess) -> bool:
+    """Whether sync has heard of the end of all scans that were cancelled."""
+    for event in sync._writer.events():
+        sync._handle(event)
+    return not sync._cancelled
 
 
 def test_a_disk_that_cannot_be_read_is_not_in_the_way(

@@ -12,6 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 from ctrl_c import heard
+from waiting import wait_until
 
 from station import cli as station_cli
 from station.core.commands import LazyGroup, Number, run
@@ -225,10 +226,7 @@ def test_rendering_that_is_told_to_end_leaves_no_semaphores(tmp_path: Path) -> N
         str(tmp_path / "out"),
     ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as rendering:
-        deadline_s = time.monotonic() + 60.0
-        while not list(tmp_path.glob("out/*/d-*.pgm")):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.05)
+        wait_until(lambda: any(tmp_path.glob("out/*/d-*.pgm")), "a picture")
         rendering.terminate()
         _, told = rendering.communicate(timeout=60.0)
     assert rendering.returncode == -signal.SIGTERM
@@ -259,10 +257,7 @@ def test_rendering_that_is_interrupted_says_what_is_left(tmp_path: Path) -> None
         start_new_session=True,
         preexec_fn=heard,
     ) as rendering:
-        deadline_s = time.monotonic() + 60.0
-        while not list(out.glob("*/d-*.pgm")):
-            assert time.monotonic() < deadline_s
-            time.sleep(0.05)
+        wait_until(lambda: any(out.glob("*/d-*.pgm")), "a picture")
         os.killpg(rendering.pid, signal.SIGINT)
         _, told = rendering.communicate(timeout=60.0)
     assert rendering.returncode == -signal.SIGINT

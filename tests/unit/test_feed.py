@@ -95,7 +95,9 @@ def test_a_replay_is_not_over_while_its_frames_wait(tmp_path: Path) -> None:
     _record(tmp_path / "front", 30)
     with replayed_feed(_config("front"), tmp_path) as feed:
         feed.cameras(20.0)
+        deadline_s = time.monotonic() + 60.0
         while not all(clock.over for clock in feed._clocks.values()):
+            assert time.monotonic() < deadline_s
             feed._receive(0.1)
         assert not feed.over
         assert len(gather_frames(feed, ["front"], 30, lambda _: None)["front"]) == 30
@@ -109,7 +111,9 @@ def test_a_slow_reader_of_a_replay_misses_nothing(tmp_path: Path) -> None:
     seen: dict[str, list[float]] = {name: [] for name in names}
     with replayed_feed(_config(*names), tmp_path) as feed:
         feed.cameras(20.0)
+        deadline_s = time.monotonic() + 60.0
         while not feed.over:
+            assert time.monotonic() < deadline_s
             time.sleep(1.0)
             for frame in feed.newest():
                 seen[frame.camera].append(float(frame.depth_m()[0, 0]))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from waiting import wait_until
 
 from station.console.security.audit import AuditLog
 from station.core import files
@@ -104,9 +105,7 @@ def test_a_document_is_whole_after_kill(tmp_path: Path) -> None:
             target=_rewrite_for_ever, args=(path,)
         )
         writer.start()
-        deadline = time.monotonic() + 20.0
-        while not path.exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(path.exists, "the document")
         time.sleep(delay_s)
         assert writer.pid is not None
         os.kill(writer.pid, signal.SIGKILL)

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 from station.archive.records import ScanRecord
 from station.booth.deletion import purge_scans
@@ -182,9 +183,7 @@ def test_a_result_is_not_sent_again_and_again_while_the_disk_refuses(
     handover.look()
     serving = threading.Thread(target=handover._serve, args=("share", stop))
     serving.start()
-    deadline_s = time.monotonic() + 20.0
-    while not handover.health()["problems"] and time.monotonic() < deadline_s:
-        time.sleep(0.01)
+    wait_until(lambda: handover.health()["problems"], "a problem")
     time.sleep(0.6)
     stop.set()
     serving.join()

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from waiting import wait_until
 
 from station.booth import scan_writer
 from station.booth.collection import Collection, Order
@@ -47,10 +48,7 @@ def test_frames_of_a_finished_scan_leave_the_memory(one_camera: BoothConfig) -> 
         # There is no calibration to check against.
         assert isinstance(ended, Ended)
         assert not ended.accepted
-        deadline_s = time.monotonic() + 20.0
-        while kept() is not None and time.monotonic() < deadline_s:
-            time.sleep(0.01)
-        assert kept() is None
+        wait_until(lambda: kept() is None, "the frame is forgotten")
     finally:
         writer.close()
 

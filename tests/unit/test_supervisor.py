@@ -7,13 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from ctrl_c import heard
 from running_station import STATION
+from waiting import wait_until
 
 from station.booth.retention import expire_old
 from station.booth.supervisor import Service, supervise
@@ -62,9 +62,8 @@ def test_every_line_of_the_log_has_one_form(tmp_path: Path) -> None:
         run = [*STATION, "run", "--config", str(config)]
         with subprocess.Popen(run, stderr=log, preexec_fn=heard) as running:
             words = ("removed ", "sync ended with code 1", "a sync process is already running")
-            while not all(word in (tmp_path / "log").read_text() for word in words):
-                assert running.poll() is None
-                time.sleep(0.1)
+            wait_until(lambda: all(word in (tmp_path / "log").read_text() for word in words))
+            assert running.poll() is None
             running.send_signal(signal.SIGINT)
         lines = (tmp_path / "log").read_text().splitlines()
     form = re.compile(r"\d\d:\d\d:\d\d [a-z ]+: (INFO|WARNING|ERROR) ")
