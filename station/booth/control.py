@@ -18,15 +18,11 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import subprocess
-import sys
 import threading
 import time
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +31,7 @@ import zmq
 
 from station.booth.health import booth_health
 from station.booth.metrics import serve_metrics
+from station.booth.retention import Tidying
 from station.booth.session import (
     FINAL,
     MAX_LABEL_LENGTH,
@@ -57,7 +54,7 @@ from station.core.scans import (
     plain_label,
     scan_id_of,
 )
-from station.core.service import Heartbeat, die_with_parent, only_process, stop_event
+from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
@@ -65,7 +62,6 @@ from station.messaging.transport import ask, dealer, publisher, server, subscrib
 
 _POLL_MS = 50
 _SYNC_TIMEOUT_S = 2.0
-_TIDY_PERIOD_S = 600.0
 _REMIND_PERIOD_S = 0.5
 _PROGRESS_KEPT = 100
 
@@ -87,8 +83,7 @@ class ControlProcess:
         self._memory = private_folder(self._folder) / "desired.json"
         self._streaming = self._remembered()
         self._wished_s = 0.0
-        self._tidied_s = -_TIDY_PERIOD_S
-        self._purge: subprocess.Popen[bytes] | None = None
+        self._tidying = Tidying(self._spool, config_path, log)
         self._unreadable = 0
         self._heart = Heartbeat(self._folder, "control")
 
@@ -109,10 +104,7 @@ class ControlProcess:
             now_s = time.monotonic()
             if now_s - self._wished_s > 1.0 / TOPICS["desired"].rate_hz:
                 self._publish_desired()
-            if now_s - self._tidied_s > _TIDY_PERIOD_S:
-                self._tidied_s = now_s
-                self._tidy()
-            self._look_at_purge()
+            self._tidying.look(now_s)
             self._heart.beat()
             if self._heart.due:
                 self._heart.report(
@@ -131,38 +123,6 @@ class ControlProcess:
     def _publish_desired(self) -> None:
         self._wished_s = time.monotonic()
         self._wishes.send_multipart([b"desired", DesiredState(self._streaming).pack()])
-
-    def _tidy(self) -> None:
-        """Remove what dead writers left, and begin to remove what is past its time.
-
-        That takes long where there is much of it: it is for a process of its own, while this one
-        answers.
-        """
-        try:
-            self._spool.sweep()
-        except OSError as error:
-            self._log.warning("what was left unfinished could not be removed: %s", error)
-        try:
-            if self._purge is not None:
-                # It hangs, or there is very much; the next one goes on where this one ends.
-                self._purge.kill()
-                return
-            command = [sys.executable, "-m", "station.cli", "purge", "--old", "--logged"]
-            self._purge = subprocess.Popen(
-                [*command, "--config", str(self._config_path)],
-                stdin=subprocess.DEVNULL,
-                preexec_fn=partial(die_with_parent, os.getpid()),
-            )
-        except OSError as error:
-            self._log.warning("old scans could not be removed: %s", error)
-
-    def _look_at_purge(self) -> None:
-        code = None if self._purge is None else self._purge.poll()
-        if code is None:
-            return
-        if code != 0:
-            self._log.warning("old scans could not be removed: the purge ended with %d", code)
-        self._purge = None
 
     def _receive(self) -> None:
         parts = self._events.recv_multipart()

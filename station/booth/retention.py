@@ -9,11 +9,15 @@ deletes later, never earlier.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
+import subprocess
+import sys
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,7 @@ from station.core.config import RetentionConfig
 from station.core.errors import SpoolError
 from station.core.files import held, read_bounded_json, write_bytes
 from station.core.scans import STATES, ScanId, boot_id
+from station.core.service import die_with_parent
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
 
@@ -29,6 +34,7 @@ _LOCK = "retention.lock"
 LONGEST_OFF_S = 4 * 86_400.0
 """A long weekend."""
 _DAY_S = 86_400.0
+_TIDY_PERIOD_S = 600.0
 _MAX_BYTES = 256 << 20
 """Two million scans: more than a spool can have, or the file could be written and not read."""
 _BUSY = SpoolError("old scans are being removed at the moment; try again")
@@ -208,3 +214,50 @@ def _exists(spool: Spool, name: str) -> bool:
     if state == "scans":
         return spool.notes.path(ScanId(scan_id)).exists()
     return (spool.folder / name).exists()
+
+
+class Tidying:
+    """Removal, every ten minutes, of what dead writers left and of what is past its time.
+
+    The second takes long where there is much of it: a process of its own does it meanwhile.
+    """
+
+    def __init__(self, spool: Spool, config_path: Path, log: logging.Logger) -> None:
+        self._spool, self._config_path, self._log = spool, config_path, log
+        self._begun_s = -_TIDY_PERIOD_S
+        self._purge: subprocess.Popen[bytes] | None = None
+
+    def look(self, now_s: float) -> None:
+        """Begin if it is time, and log a removal that failed.
+
+        Args:
+            now_s: the monotonic clock's.
+        """
+        if now_s - self._begun_s > _TIDY_PERIOD_S:
+            self._begun_s = now_s
+            self._begin()
+        code = None if self._purge is None else self._purge.poll()
+        if code is None:
+            return
+        if code != 0:
+            self._log.warning("old scans could not be removed: the purge ended with %d", code)
+        self._purge = None
+
+    def _begin(self) -> None:
+        try:
+            self._spool.sweep()
+        except OSError as error:
+            self._log.warning("what was left unfinished could not be removed: %s", error)
+        try:
+            if self._purge is not None:
+                # It hangs, or there is very much; the next one goes on where this one ends.
+                self._purge.kill()
+                return
+            command = [sys.executable, "-m", "station.cli", "purge", "--old", "--logged"]
+            self._purge = subprocess.Popen(
+                [*command, "--config", str(self._config_path)],
+                stdin=subprocess.DEVNULL,
+                preexec_fn=partial(die_with_parent, os.getpid()),
+            )
+        except OSError as error:
+            self._log.warning("old scans could not be removed: %s", error)
