@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 
 BODIES = Path(__file__).parents[1] / "station/simulation/bodies"
 
+_OF_ONE_STATION = (
+    "api", "attacks", "crooked_requests", "exports",
+    "page", "page_booth", "page_results", "page_views", "security",
+)  # fmt: skip
 _TOGETHER = (
     [f"tests/accuracy/test_{name}.py" for name in ("bars", "model_accuracy", "unlike")],
-    [
-        f"tests/console/test_{name}.py"
-        for name in ("api", "attacks", "crooked_requests", "exports", "page", "security")
-    ],
+    [f"tests/console/test_{name}.py" for name in _OF_ONE_STATION],
 )
 """Files that share what takes half a minute to make: the database of bodies; a station's scans."""
 

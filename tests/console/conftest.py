@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from console_page import browser, log_in, tablet
 from live_console import LiveConsole
+from playwright.sync_api import Page
 
 from station.core.files import write_json
 from station.core.scans import REASON
@@ -38,6 +40,20 @@ def scans(console: LiveConsole) -> list[dict[str, Any]]:
         found = [console.scan("Order 1234"), console.scan("<script>alert(1)</script>")]
     assert all(scan["state"] in ("delivered", "rescan") for scan in found), found
     return found
+
+
+@pytest.fixture
+def fresh() -> Iterator[Page]:
+    """An empty page of a tablet that nobody is logged in at."""
+    with browser() as started:
+        yield tablet(started).new_page()
+
+
+@pytest.fixture
+def page(fresh: Page, console: LiveConsole) -> Page:
+    """The console's page after the log-in."""
+    log_in(fresh, console)
+    return fresh
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """The page in Debian's chromium against a real station: what an operator does, and what goes wrong.
 
-`make test-console` runs it: pytest finds it only when it is named; test_page.py is its short form.
+`make test-console` runs it: pytest finds it only when it is named; the short form is test_page*.py.
 Pictures of every view go to the folder that CONSOLE_PICTURES names.
 """
 
