@@ -1,4 +1,4 @@
-"""Import rules, read from the code, and from the modules that a started process really loads."""
+"""Import rules and sizes, read from the code, and what a started process really loads."""
 
 import ast
 import subprocess
@@ -29,6 +29,7 @@ PURE_FOLDERS = (
 )
 OPEN3D = ("workers/", "station/simulation/")
 MAX_MODULES = 14
+MAX_MODULE_LINES, MAX_FUNCTION_LINES = 350, 60
 
 
 def _imports(path: Path) -> Iterator[str]:
@@ -119,6 +120,19 @@ def test_no_folder_is_too_wide_to_find_a_module_in() -> None:
         if count > MAX_MODULES + (folder / "__init__.py").exists()
     }
     assert wide == {}
+
+
+def test_nothing_is_too_long_to_be_read_at_once() -> None:
+    long = []
+    for path in _sources("station", "workers"):
+        text = path.read_text()
+        if (lines := len(text.splitlines())) > MAX_MODULE_LINES:
+            long.append((path, lines))
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                long += [(path / node.name, lines)] if lines > MAX_FUNCTION_LINES else []
+    assert long == []
 
 
 def test_every_package_says_what_belongs_there() -> None:

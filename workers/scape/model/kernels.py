@@ -11,13 +11,7 @@ import numpy as np
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
-    blocks,
-    parents,
-    rotations,
-    beta,
-    twists,
-    positions,
-    derivative,
+    blocks, parents, rotations, beta, twists, positions, derivative
 ):
     """Add the blocks of every sample to its position and derivative.
 
@@ -70,17 +64,8 @@ def add_blocks(  # type: ignore[no-untyped-def]  # pragma: no cover
                 y += field[1, j] * twists[joint, j]
                 z += field[2, j] * twists[joint, j]
             _turn(positions[v], derivative[v], part, turn, x, y, z)
-            # The relative twist changes by back^T (turn of the joint's part - turn of its parent).
             parent = parents[joint]
-            back = rotations[parent]
-            for i in range(3):
-                a = turn[i, 0] * field[0, 0] + turn[i, 1] * field[1, 0] + turn[i, 2] * field[2, 0]
-                b = turn[i, 0] * field[0, 1] + turn[i, 1] * field[1, 1] + turn[i, 2] * field[2, 1]
-                c = turn[i, 0] * field[0, 2] + turn[i, 1] * field[1, 2] + turn[i, 2] * field[2, 2]
-                for j in range(3):
-                    change = a * back[j, 0] + b * back[j, 1] + c * back[j, 2]
-                    derivative[v, i, 3 * joint + j] += change
-                    derivative[v, i, 3 * parent + j] -= change
+            _follow_twist(derivative[v], joint, parent, turn, rotations[parent], field)
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
@@ -99,6 +84,20 @@ def _turn(position, derivative, part, turn, x, y, z):  # type: ignore[no-untyped
     derivative[1, column + 2] += a
     derivative[2, column] += b
     derivative[2, column + 1] -= a
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _follow_twist(derivative, joint, parent, turn, back, field):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the derivative of a part's field (3, 3) by a joint's relative twist, which changes by
+    back^T (turn of the joint's part - turn of its parent)."""
+    for i in range(3):
+        a = turn[i, 0] * field[0, 0] + turn[i, 1] * field[1, 0] + turn[i, 2] * field[2, 0]
+        b = turn[i, 0] * field[0, 1] + turn[i, 1] * field[1, 1] + turn[i, 2] * field[2, 1]
+        c = turn[i, 0] * field[0, 2] + turn[i, 1] * field[1, 2] + turn[i, 2] * field[2, 2]
+        for j in range(3):
+            change = a * back[j, 0] + b * back[j, 1] + c * back[j, 2]
+            derivative[i, 3 * joint + j] += change
+            derivative[i, 3 * parent + j] -= change
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

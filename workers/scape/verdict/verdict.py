@@ -134,17 +134,11 @@ def judge(
     if not reasons and rms_m > _SCATTER_M:
         remedy = "run: station check" if cameras else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
+    again = bool(reasons)
     missing = _missing(
-        parts,
-        findings,
-        lost,
-        unseen,
-        cameras=cameras,
-        again=bool(reasons),
-        half=bool(halves),
-        everywhere=everywhere,
+        parts, findings, lost, unseen, halves, cameras=cameras, again=again, everywhere=everywhere
     )
-    return Verdict("rescan" if reasons else "ok", tuple(reasons), tuple(notes), missing)
+    return Verdict("rescan" if again else "ok", tuple(reasons), tuple(notes), missing)
 
 
 def _stature_of_nobody(stature_m: float) -> list[str]:
@@ -233,10 +227,10 @@ def _missing(
     findings: Sequence[Finding],
     lost: Mapping[str, str],
     unseen: Mapping[str, str],
+    halves: Sequence[str],
     *,
     cameras: bool,
     again: bool,
-    half: bool,
     everywhere: bool,
 ) -> tuple[str, ...]:
     """Parts, and the floor, where nothing can be measured.
@@ -244,8 +238,8 @@ def _missing(
     Args:
         lost: reasons by the part that does not match the scan or was misplaced.
         unseen: what `_unseen_parts` gives.
+        halves: what `_unseen_sides` gives.
         again: the scan is to be taken again.
-        half: a side of the person was not seen.
         everywhere: the body was fitted to something else.
     """
     missing = [*(name for name in lost if name), *unseen]
@@ -258,7 +252,7 @@ def _missing(
     missing += [FLOOR for finding in findings if finding.code in OFF_FLOOR]
     if everywhere:
         missing += [part.name for part in parts]
-    elif half or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
+    elif halves or any({f"upper_arm_{side}", f"thigh_{side}"} <= unseen.keys() for side in _LIMBS):
         missing += [
             part.name for part in parts if part.name in TRUNK or part.coverage < _HALF_COVERAGE
         ]
