@@ -187,7 +187,6 @@ def render_bundle(
     booth: SimulatedBooth | None = None,
     *,
     frames: int = 10,
-    scan_id: str = "virtual",
 ) -> Path:
     """Write the scan bundle that a booth with this body in it would give."""
     booth = booth or SimulatedBooth()
@@ -202,7 +201,7 @@ def render_bundle(
         ]
     write_bundle(
         folder,
-        scan_id=scan_id,
+        scan_id="virtual",
         created="2026-01-01T00:00:00Z",
         label="virtual",
         depth_scale_m=DEPTH_SCALE_M,

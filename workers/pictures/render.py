@@ -34,7 +34,7 @@ _AWAY_M = 4.0
 """Distance of the camera's plane from the middle of the world."""
 _PNG_HEADER = 33
 """Length of a PNG's signature and its first chunk."""
-_FONT = "sans"
+_FONT, _WEIGHT = "sans", 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +118,10 @@ def render_mesh(
     return Scene(vertices, faces).render(frame, colors).picture
 
 
-def draw_line(
-    picture: Picture, line: Array, color: Color, *, thickness: int = 2, closed: bool = False
-) -> None:
+def draw_line(picture: Picture, line: Array, color: Color, *, thickness: int = 2) -> None:
     """Draw a smooth line through picture points (n, 2)."""
     fixed = np.rint(line * 16.0).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(picture, [fixed], closed, color, thickness, cv2.LINE_AA, shift=4)
+    cv2.polylines(picture, [fixed], False, color, thickness, cv2.LINE_AA, shift=4)
 
 
 def draw_points(picture: Picture, points: Array, colors: NDArray[np.uint8]) -> None:
@@ -141,17 +139,14 @@ def write_text(
     *,
     size: int = 14,
     color: Color = TEXT_COLOR,
-    bold: bool = False,
 ) -> None:
     """Write text whose first letter is at a picture point."""
-    weight = 600 if bold else 400
-    cv2.putText(picture, text, at, color, cv2.FontFace(_FONT), size, weight)
+    cv2.putText(picture, text, at, color, cv2.FontFace(_FONT), size, _WEIGHT)
 
 
-def text_width(text: str, *, size: int = 14, bold: bool = False) -> int:
+def text_width(text: str, *, size: int = 14) -> int:
     """Width of a text in pixels."""
-    weight = 600 if bold else 400
-    box = cv2.getTextSize((4096, 256), text, (0, 128), cv2.FontFace(_FONT), size, weight)
+    box = cv2.getTextSize((4096, 256), text, (0, 128), cv2.FontFace(_FONT), size, _WEIGHT)
     return int(box[2])
 
 

@@ -33,10 +33,10 @@ class TimeGrid:
     knot_s: float = KNOT_S
 
     @classmethod
-    def over(cls, times_s: Array, margin_s: float = KNOT_S, knot_s: float = KNOT_S) -> TimeGrid:
-        """Knots that cover all times and a margin."""
-        start = float(times_s.min()) - margin_s
-        count = int(np.ceil((times_s.max() + margin_s - start) / knot_s)) + 3
+    def over(cls, times_s: Array, knot_s: float = KNOT_S) -> TimeGrid:
+        """Knots that cover all times and a margin of `KNOT_S`."""
+        start = float(times_s.min()) - KNOT_S
+        count = int(np.ceil((times_s.max() + KNOT_S - start) / knot_s)) + 3
         return cls(start, count, knot_s)
 
     def basis(self, times_s: Array) -> tuple[Indices, Array, Array]:

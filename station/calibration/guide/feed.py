@@ -165,14 +165,13 @@ class Feed:
         self._waiting.clear()
         return taken
 
-    def newest(self, timeout_s: float = 0.2) -> list[TimedFrame]:
+    def newest(self) -> list[TimedFrame]:
         """The newest frame of each camera since the last call, for callers slower than the cameras.
 
         Of a replay all frames, so that the result does not depend on the machine's speed.
         """
-        if self._clocks:
-            return self.frames(timeout_s)
-        return list({frame.camera: frame for frame in self.frames(timeout_s)}.values())
+        frames = self.frames()
+        return frames if self._clocks else list({frame.camera: frame for frame in frames}.values())
 
     def _why(self, name: str) -> str:
         return f"gives no frames{self._intake.why(name)}"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 JUMP_RATIO = 0.02
 """Neighbouring readings of one surface differ by less than this share of their depth a pixel."""
+_JUMP_RADIUS_PX = 2
 
 
 def inverse_depth(depth_m: Image) -> Image:
@@ -19,12 +20,13 @@ def inverse_depth(depth_m: Image) -> Image:
     return np.divide(np.float32(1.0), depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
 
 
-def jumps(depth_m: Image, radius_px: int = 2) -> NDArray[np.bool_]:
-    """Pixels within a radius of a depth discontinuity, where readings mix two surfaces."""
+def jumps(depth_m: Image) -> NDArray[np.bool_]:
+    """Mask (h, w) of the pixels near a depth discontinuity, where readings mix two surfaces."""
     import cv2
 
-    window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
+    side = 2 * _JUMP_RADIUS_PX + 1
+    window = np.ones((side, side), np.uint8)
     seen = depth_m > 0
     far = cv2.dilate(depth_m, window)
     near = cv2.erode(np.where(seen, depth_m, np.float32(99.0)), window)
-    return np.asarray(seen & (far - near > JUMP_RATIO * radius_px * depth_m))
+    return np.asarray(seen & (far - near > JUMP_RATIO * _JUMP_RADIUS_PX * depth_m))
