@@ -6,8 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from station.archive.tables import Unit
 from station.booth.session import MAX_LABEL_LENGTH
 from station.core.words.tables import Pose
+from station.core.words.terms import Language, Side
 
 State = Literal[
     "countdown", "armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"
@@ -34,7 +36,7 @@ class Session(BaseModel):
     password_set: bool
     name: str
     scopes: list[str]
-    language: Literal["en", "zh"]
+    language: Language
     unit: Literal["cm", "in"]
     countdown_s: int
     recordings: bool = Field(description="calibrations replay recordings")
@@ -157,7 +159,7 @@ class Row(BaseModel):
 
     name: str
     words: str
-    side: Literal["", "left", "right"]
+    side: Side
     value: float | None = Field(
         description="null where the part is missing in the scan, or the body has no such line"
     )
@@ -188,7 +190,7 @@ class Measurements(BaseModel):
     verdict: str
     created: str
     pose: Pose
-    unit: Literal["cm", "in", "m"]
+    unit: Unit
     rows: list[Row]
     differences: list[SideDifference]
 
@@ -215,7 +217,7 @@ class ComparedRow(BaseModel):
 
     name: str
     words: str
-    side: Literal["", "left", "right"]
+    side: Side
     first: float
     second: float
     difference: float
@@ -229,7 +231,7 @@ class Comparison(BaseModel):
     first: Scan
     second: Scan
     pose: Pose
-    unit: Literal["cm", "in", "m"]
+    unit: Unit
     rows: list[ComparedRow]
     surface_rms_m: float
     surface_p95_m: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
@@ -50,22 +50,18 @@ def list_scans(
     ] = None,
     since: Annotated[str, Query(max_length=40, description="ISO 8601, UTC")] = "",
     until: Annotated[str, Query(max_length=40, description="ISO 8601, UTC, excluded")] = "",
-    state: Annotated[
-        list[Literal["accepted", "reconstructing", "delivered", "rescan", "failed"]],
-        Query(max_length=5),
-    ] = [],  # noqa: B006  # FastAPI copies it
+    state: Annotated[list[ScanState], Query(max_length=5)] = [],  # noqa: B006  # FastAPI copies it
     cursor: Annotated[str, Query(max_length=200, description="`next` of the page before")] = "",
     limit: Annotated[int, Query(ge=1, le=500)] = 50,
 ) -> ScanPage:
     """Search by label, id, time and state; the newest first."""
     created, _, scan_id = cursor.partition(" ")
-    states: list[ScanState] = list(state)
     found = console.index.find(
         text,
         label=label,
         since=since,
         until=until,
-        states=states,
+        states=state,
         before=(created, scan_id) if cursor else None,
         limit=limit,
     )
