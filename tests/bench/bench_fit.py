@@ -55,6 +55,7 @@ from unlike_sensor import render_unlike
 from station.core.bundle import read_bundle
 from station.core.config import Volume
 from station.core.errors import BoothError
+from station.core.words.terms import part_in_words
 from station.simulation.scene import Mesh
 from station.simulation.sensor import render_bundle
 from workers.cloud.observed import Preprocessed
@@ -63,7 +64,6 @@ from workers.reconstruct.job import reconstruct_bundle, warm_up
 from workers.scape.fit.fit import fit_body, sampling_of
 from workers.scape.fit.initial import starting_states
 from workers.scape.model.body_model import BodyModel
-from workers.scape.verdict.seen_words import part_in_words
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from fit_cases import Case
 from surface_errors import SurfaceErrors
 
+from station.core.words.terms import part_in_words
 from workers.scape.fit.fit import FitResult
-from workers.scape.verdict.seen_words import part_in_words
 
 _LOST_MM = 15.0
 _PAPERS_SECONDS = 60.0

@@ -14,9 +14,9 @@ from spoken import SPOKEN
 from station.archive.phrases import PHRASES, in_language, untranslated
 from station.calibration.detect.coverage import Coverage
 from station.calibration.guide.steps import _rest_line, _wave_line
+from station.core.words.terms import part_in_words
 from station.simulation.scene import default_rig
 from workers.scape.model.body_model import load_model
-from workers.scape.verdict.seen_words import part_in_words
 
 ROOT = Path(__file__).parents[2]
 SPEAKERS = (

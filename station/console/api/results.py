@@ -25,7 +25,7 @@ from station.console.api.scans import of_record
 from station.core.errors import FormatError
 from station.core.files import MAX_JSON_BYTES, read_bounded_json
 from station.core.words.tables import Pose
-from station.core.words.terms import Language
+from station.core.words.terms import Language, part_in_words
 
 router = APIRouter(prefix="/scans/{scan_id}", tags=["results"])
 FileName = Annotated[str, PathParameter(pattern=r"^[a-z0-9][a-z0-9.-]{0,60}$")]
@@ -108,17 +108,11 @@ def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
                 name=name,
                 coverage=part["coverage"],
                 residual_rms_m=part["residual_rms_m"],
-                doubtful=re.search(rf"\b{_words(name)}\b", reasons) is not None,
+                doubtful=re.search(rf"\b{part_in_words(name)}\b", reasons) is not None,
             )
             for name, part in parts.items()
         ],
     )
-
-
-def _words(part: str) -> str:
-    """A part as reasons name it: forearm_left -> left forearm."""
-    stem, _, side = part.rpartition("_")
-    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
 
 
 @dataclass(frozen=True, slots=True)

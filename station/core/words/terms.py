@@ -1,4 +1,4 @@
-"""Names of measurements: plain names in two languages, and SeamlyMe's."""
+"""Names of measurements, in two languages and SeamlyMe's, and of parts of the body."""
 
 from __future__ import annotations
 
@@ -132,3 +132,9 @@ def plain_name(name: str, language: Language = "en", *, with_side: bool = True) 
         return words
     english, chinese = SIDES[side]
     return f"{chinese}{words}" if language == "zh" else f"{words}, {english}"
+
+
+def part_in_words(part: str) -> str:
+    """A part of the body as a verdict's reasons name it: forearm_left -> left forearm."""
+    stem, side = split_side(part)
+    return f"{side} {stem.replace('_', ' ')}" if side else part

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from station.core.geometry import so3_log
+from station.core.words.terms import part_in_words
 from workers.cloud.observed import UNKNOWN_FLOOR, Finding
 from workers.scape.evidence.crown import FACE_ALONE_M
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
-from workers.scape.verdict.seen_words import part_in_words
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 
-def part_in_words(part: str) -> str:
-    """Name of a part for the operator: "left forearm" of "forearm_left"."""
-    stem, _, side = part.rpartition("_")
-    return f"{side} {stem.replace('_', ' ')}" if side in ("left", "right") else part
-
-
 def little_seen(share: float, what: str, *, cameras: bool) -> str:
     """Sentence on a part or side of which too small a share was seen.
 

@@ -9,10 +9,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from station.core.words.terms import part_in_words
 from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
 from workers.scape.verdict.seen import TRUNK, PartReport, named_parts
-from workers.scape.verdict.seen_words import little_seen, many_hardly_seen, part_in_words
+from workers.scape.verdict.seen_words import little_seen, many_hardly_seen
 from workers.scape.verdict.unmatched import ELSEWHERE_M, Patch
 
 Array = NDArray[np.float64]
