@@ -133,7 +133,7 @@ class HandOver:
         received = False
         for entry in due:
             self._round_s[name] = time.monotonic()
-            received |= self._try(entry, now_s)
+            received |= self._try(entry)
             self._settle(entry)
         if received:
             # The others need not wait as long as after their own failures.
@@ -153,7 +153,7 @@ class HandOver:
             self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
         self._ledger.forget(entry.scan_id)
 
-    def _try(self, entry: Waiting, now_s: float) -> bool:
+    def _try(self, entry: Waiting) -> bool:
         """Hand one result over; whether the target has received it."""
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
@@ -161,12 +161,12 @@ class HandOver:
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
-            self._postpone(entry, str(error), now_s)
+            self._postpone(entry, str(error))
             return False
         except Exception as error:
             # One result that is damaged must not keep the others from being handed over.
             self._log.exception("handing over %s", entry.scan_id, extra={"scan": entry.scan_id})
-            self._postpone(entry, f"{type(error).__name__}: {error}", now_s)
+            self._postpone(entry, f"{type(error).__name__}: {error}")
             return False
         self._ledger.finish(entry)
         self._log.info(
@@ -174,7 +174,9 @@ class HandOver:
         )
         return True
 
-    def _postpone(self, entry: Waiting, reason: str, now_s: float) -> None:
+    def _postpone(self, entry: Waiting, reason: str) -> None:
+        # From the end of the try: a slow receiver would get the next one without a pause.
+        now_s = time.time()
         after = entry.failed(reason, now_s)
         self._ledger.keep(after)
         self._log.warning(

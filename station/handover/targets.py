@@ -7,6 +7,7 @@ import hmac
 import http.client
 import json
 import shutil
+import ssl
 import time
 import urllib.error
 import urllib.request
@@ -101,6 +102,23 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         del req, fp, code, msg, headers, newurl
 
 
+def _refusal(url: str, cause: Exception) -> HandOverError:
+    """The words for a POST that the receiver did not accept."""
+    if isinstance(cause, urllib.error.HTTPError):
+        if cause.code // 100 == 3:
+            return HandOverError(
+                f"{url} answers {cause.code}, a redirection, which is not followed"
+            )
+        return HandOverError(f"{url} answers {cause.code}")
+    if isinstance(cause, TimeoutError):
+        return HandOverError(f"{url} has not answered within {_TIMEOUT_S:g} s")
+    reason = getattr(cause, "reason", cause)
+    if isinstance(reason, ssl.SSLCertVerificationError):
+        return HandOverError(f"the certificate of {url} is not trusted ({reason.verify_message})")
+    words = getattr(reason, "strerror", None) or str(reason).strip()
+    return HandOverError(f"{url} cannot be reached ({words})")
+
+
 class WebhookTarget:
     """Posts a result's JSON with links to its files, signed.
 
@@ -126,13 +144,9 @@ class WebhookTarget:
         try:
             with opener.open(request, timeout=_TIMEOUT_S):
                 pass
-        except urllib.error.HTTPError as cause:
-            raise HandOverError(f"{self._url} answers {cause.code}") from None
         except (OSError, ValueError, http.client.HTTPException) as cause:
             # What is no HTTP is neither an OSError nor a ValueError.
-            reason = getattr(cause, "reason", cause)
-            words = getattr(reason, "strerror", None) or str(reason).strip()
-            raise HandOverError(f"{self._url} cannot be reached ({words})") from None
+            raise _refusal(self._url, cause) from None
 
     def signature(self, body: bytes, seconds: int) -> str:
         """The header's value.

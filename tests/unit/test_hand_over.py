@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import logging
 import os
 import shutil
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.error import URLError
 
 import pytest
 from waiting import wait_until
@@ -25,7 +29,7 @@ from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
-from station.handover.targets import HandOverError, make_target
+from station.handover.targets import HandOverError, _refusal, make_target
 
 _CAMERA = '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
 _IDS = ("20261121T100000Z-0001", "20261121T100000Z-0002")
@@ -70,6 +74,62 @@ def test_what_is_no_webhook_is_tried_again(tmp_path: Path, no_http: int, place: 
     config = DeliverConfig(name="orders", url=url, secret_file=tmp_path / "secret")
     with pytest.raises(HandOverError, match=r"\A[^\n]*\Z"):
         make_target(config)(_scan(), _result(tmp_path / "result", measurements=[]))
+
+
+@pytest.fixture
+def receiver() -> Iterator[tuple[str, dict[str, str]]]:
+    """A webhook's address, and the answer that it gives: a line and headers, after a pause."""
+    answer = {"line": "200 OK", "pause_s": "0"}
+
+    class Receiver(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            time.sleep(float(answer["pause_s"]))
+            with contextlib.suppress(OSError):
+                self.wfile.write(f"HTTP/1.0 {answer['line']}\r\nLocation: /else\r\n\r\n".encode())
+
+        def log_message(self, *_: object) -> None:
+            """Tell nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Receiver) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/booth", answer
+        server.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("line", "pause_s", "words"),
+    [
+        ("500 Error", "0", r"/booth answers 500\Z"),
+        ("302 Found", "0", "answers 302, a redirection, which is not followed"),
+        ("200 OK", "0.5", r"has not answered within 0\.1 s"),
+    ],
+)
+def test_a_receiver_that_does_not_accept_is_told_in_words(
+    tmp_path: Path,
+    receiver: tuple[str, dict[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    line: str,
+    pause_s: str,
+    words: str,
+) -> None:
+    """A slow one "cannot be reached", although it had the result."""
+    url, answer = receiver
+    answer |= {"line": line, "pause_s": pause_s}
+    monkeypatch.setattr("station.handover.targets._TIMEOUT_S", 0.1 if pause_s != "0" else 10.0)
+    (tmp_path / "secret").write_text("topsecret")
+    config = DeliverConfig(name="orders", url=url, secret_file=tmp_path / "secret")
+    with pytest.raises(HandOverError, match=words):
+        make_target(config)(_scan(), _result(tmp_path / "result", measurements=[]))
+
+
+def test_an_untrusted_certificate_is_named_as_such() -> None:
+    cause = ssl.SSLCertVerificationError(1, "[SSL: CERTIFICATE_VERIFY_FAILED] (_ssl.c:1006)")
+    cause.verify_message = "self-signed certificate"
+    said = str(_refusal("https://shop.example", URLError(cause)))
+    assert said == (
+        "the certificate of https://shop.example is not trusted (self-signed certificate)"
+    )
 
 
 def test_a_share_that_cannot_be_looked_at_is_tried_again(tmp_path: Path) -> None:
@@ -164,6 +224,23 @@ def test_a_result_that_is_taken_away_during_a_try_is_waited_for_no_longer(
     handover.look()
     handover.try_all("share", 1e9)
     assert Ledger(tmp_path / "spool").waiting() == []
+
+
+def test_the_pause_begins_when_a_try_has_failed(handover: HandOver, tmp_path: Path) -> None:
+    """A receiver that answered after its time limit got the next try without a pause."""
+
+    ended_s = list[float]()
+
+    def slow(scan: ScanRecord, result: Path) -> None:  # noqa: ARG001
+        time.sleep(0.2)
+        ended_s.append(time.time())
+        raise HandOverError("it has not answered")
+
+    handover._targets["share"] = slow
+    handover.look()
+    handover.try_all("share", time.time())
+    [entry] = Ledger(tmp_path / "spool").waiting()
+    assert entry.next_s >= ended_s[0] + PAUSES_S[0]
 
 
 def test_a_result_is_not_sent_again_and_again_while_the_disk_refuses(
