@@ -82,7 +82,8 @@ def advance(ages: Ages, now: Moment) -> Ages:
     last = ages.last
     if last is None:
         passed_s = 0.0
-    elif last.boot == now.boot:
+    elif last.boot == now.boot or not (last.boot and now.boot):
+        # Of an unknown boot, too: its time since the boot may have been counted already.
         passed_s = max(0.0, now.since_boot_s - last.since_boot_s)
     else:
         off_s = now.wall_s - last.wall_s - now.since_boot_s

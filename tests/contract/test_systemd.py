@@ -53,6 +53,13 @@ def test_a_service_comes_back_whatever_happens(path: Path) -> None:
         assert int(unit["Service"]["MemoryMax"][:-1]) > 0
 
 
+def test_no_service_hides_the_others_or_the_boot() -> None:
+    """Each removed at its start, and control every hour, what the others were writing, and a day
+    without power counted as none."""
+    for path in (*SERVICES, COMMON):
+        assert not {"ProtectProc", "ProcSubset"} & set(_read(path)["Service"])
+
+
 def test_pauses_are_written_as_sleep_reads_them() -> None:
     """systemd's "20min" ended the drift check before it began."""
     pauses = [

@@ -223,6 +223,17 @@ def test_a_wall_clock_that_jumps_deletes_nothing(spool: Spool, jump_days: float)
         assert expire_old(spool, RetentionConfig(raw_days=5), moment) == []
 
 
+@pytest.mark.parametrize("boots", [("", "boot"), ("boot", ""), ("", "")])
+def test_the_time_since_an_unknown_boot_counts_once(spool: Spool, boots: tuple[str, str]) -> None:
+    """An upgrade after a month without a restart deleted the results of a month."""
+    spool.path("done", "a").mkdir()
+    moments = [Moment(1.8e9, 30 * _DAY_S + n, boot) for n, boot in enumerate(boots)]
+    assert [expire_old(spool, RetentionConfig(raw_days=5), moment) for moment in moments] == [
+        [],
+        [],
+    ]
+
+
 def test_a_station_that_was_off_for_the_night_counts_it(spool: Spool) -> None:
     spool.path("done", "a").mkdir()
     for day in range(4):

@@ -170,6 +170,24 @@ def test_a_killed_process_comes_back(machine: Machine) -> None:
     _scan(machine, "after kill -9")
 
 
+def test_a_start_removes_nothing_that_another_process_writes(machine: Machine) -> None:
+    writer = _shown(machine, "booth-workers")["MainPID"]
+    made_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    written, left = (f"{STATE}/spool/tmp/probe.{pid}.{made_ns}" for pid in (writer, "999999999"))
+    machine.run("install", "-d", "-o", "booth", "-g", "booth", written, left)
+    for unit in ("booth-sync", "booth-control"):
+        machine.run("systemctl", "restart", unit)
+    place = machine.root / left.lstrip("/")
+    _until(lambda: not place.exists(), "what a dead process left is removed")
+    _ready(machine)
+    machine.run("rmdir", written)
+
+
+def test_notes_know_their_boot(machine: Machine) -> None:
+    note = machine.root / STATE.lstrip("/") / "spool/scans" / f"{_scan(machine, 'a boot')}.json"
+    assert json.loads(note.read_text())["boot"]
+
+
 def test_a_process_that_hangs_is_started_anew(machine: Machine) -> None:
     """SIGSTOP to all at once; each has its own watchdog."""
     units = _services(machine)
