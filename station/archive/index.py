@@ -19,7 +19,7 @@ from pathlib import Path
 from station.archive.records import PLACES, ScanRecord, ScanState, read_record
 from station.core.errors import SpoolError
 from station.core.files import private_file
-from station.core.scans import is_scan_id, plain_label
+from station.core.scans import ScanId, plain_label, scans_of
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
@@ -253,10 +253,9 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
     database.execute("COMMIT")
 
 
-def _names(folder: Path) -> list[str]:
+def _names(folder: Path) -> list[ScanId]:
     try:
-        with os.scandir(folder) as entries:
-            return [entry.name for entry in entries if is_scan_id(entry.name)]
+        return scans_of(folder)
     except OSError:
         return []
 

@@ -25,7 +25,7 @@ from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import Version, version_of
 from station.core.rig import Rig
-from station.core.scans import CANCELLED, STATES, count_scans, failure_reason
+from station.core.scans import CANCELLED, STATES, ScanId, count_scans, failure_reason, scans_of
 from station.core.service import NOTHING_RUNS, read_health
 from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
@@ -55,7 +55,7 @@ class BoothHealth:
     spool: dict[str, int]
     """Scans in each folder; failed/ has the cancelled ones, too."""
     oldest_waiting_s: float
-    stuck: list[str]
+    stuck: list[ScanId]
     """Claimed scans that should have ended."""
     free_bytes: int
     problems: list[str] = field(default_factory=list)
@@ -243,12 +243,12 @@ def _count_cancelled(failed: Path, changed_ns: int, count: int) -> int:  # noqa:
     return sum(failure_reason(folder) == CANCELLED for folder in failed.iterdir())
 
 
-def _entries(folder: Path) -> dict[str, os.stat_result]:
-    """Entries of a folder of the spool, without those that leave it at this moment."""
+def _entries(folder: Path) -> dict[ScanId, os.stat_result]:
+    """Scans in a folder of the spool, without those that leave it at this moment."""
     found = {}
-    for entry in folder.iterdir():
+    for name in scans_of(folder):
         with suppress(FileNotFoundError):
-            found[entry.name] = entry.stat()
+            found[name] = (folder / name).stat()
     return found
 
 
@@ -257,7 +257,9 @@ def _is_full(config: BoothConfig, free_bytes: int) -> bool:
     return free_bytes < config.spool.min_free_mb * 1e6
 
 
-def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], float, list[str], int]:
+def _disk(
+    config: BoothConfig, problems: list[str]
+) -> tuple[dict[str, int], float, list[ScanId], int]:
     """Counts of scans, age of the oldest waiting one, stuck ones, free bytes."""
     folder = config.spool.folder
     if not folder.is_dir():

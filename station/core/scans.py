@@ -315,12 +315,21 @@ class ScanFolders:
 
     def scans_in(self, state: str) -> list[ScanId]:
         """Scan ids in one of the folders, oldest first."""
-        with os.scandir(self.folder / state) as entries:
-            return sorted(
-                ScanId(entry.name)
-                for entry in entries
-                if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
-            )
+        return scans_of(self.folder / state)
+
+
+def scans_of(folder: Path) -> list[ScanId]:
+    """Scan ids in a folder of a spool, oldest first; what is no scan's folder is left out.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    with os.scandir(folder) as entries:
+        return sorted(
+            ScanId(entry.name)
+            for entry in entries
+            if is_scan_id(entry.name) and entry.is_dir(follow_symlinks=False)
+        )
 
 
 def count_scans(folder: Path) -> dict[str, int]:
@@ -330,7 +339,7 @@ def count_scans(folder: Path) -> dict[str, int]:
         OSError: the spool belongs to another user.
     """
     found = {state: folder / state for state in STATES if (folder / state).is_dir()}
-    counts = {state: len(os.listdir(place)) for state, place in found.items()}
+    counts = {state: len(scans_of(place)) for state, place in found.items()}
     return {state: count for state, count in counts.items() if count}
 
 

@@ -158,7 +158,7 @@ def test_a_clock_that_was_put_back_lets_the_watch_rest(
         looks.append("index")
         return find(self, **options)
 
-    def named(folder: Path) -> list[str]:
+    def named(folder: Path) -> list[ScanId]:
         looks.append("folder")
         return names(folder)
 

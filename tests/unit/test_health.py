@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 from sync_process import sync_of
 
+from station.archive.index import ScanIndex
 from station.booth.frameset import rate_hz
 from station.booth.health import MAX_AGE_S, booth_health, can_scan, starting, unusable
 from station.booth.metrics import BoothCollector
@@ -27,7 +28,7 @@ from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import held
 from station.core.rig import Rig
-from station.core.scans import CANCELLED, scan_id_of
+from station.core.scans import CANCELLED, ScanId, scan_id_of
 from station.core.service import HEALTH, STATION_LOCK, answered, file_name
 from station.core.spool import Spool
 from station.messaging import asking
@@ -377,12 +378,25 @@ def test_cancelled_scans_are_not_said_to_have_failed(config: BoothConfig) -> Non
     assert booth_health(config).cancelled == 2
 
 
-def test_a_scan_that_moves_on_while_it_is_looked_at_is_no_fault(config: BoothConfig) -> None:
-    """The disk was said to be unreadable and full, for as long as a worker took to claim a scan.
-    A link that leads nowhere is listed and is not there, as such a scan."""
+def test_what_is_no_scan_does_not_wait_in_the_queue(config: BoothConfig) -> None:
+    """A file there, which nobody reconstructs, was listed and counted as a scan that waits for
+    ever."""
     spool = Spool(config.spool.folder)
-    spool.path("queue", "a").symlink_to("/nowhere")
-    spool.path("work", "a").symlink_to("/nowhere")
+    for state in ("queue", "work", "outbox"):
+        spool.path(state, "notes-of-the-owner").write_text("")
+        spool.path(state, "no scan.d").mkdir()
+    os.utime(spool.path("queue", "notes-of-the-owner"), (0.0, 0.0))
+    health = booth_health(config)
+    assert (health.spool, health.oldest_waiting_s) == ({}, 0.0)
+    assert ScanIndex(spool).find() == []
+
+
+def test_a_scan_that_moves_on_while_it_is_looked_at_is_no_fault(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk was said to be unreadable and full, for as long as a worker took to claim a scan."""
+    Spool(config.spool.folder)
+    monkeypatch.setattr("station.booth.health.scans_of", lambda _: [ScanId("a")])
     health = booth_health(config)
     assert not [problem for problem in health.problems if "disk" in problem]
     assert health.free_bytes > 0
