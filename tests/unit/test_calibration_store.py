@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from seen_balls import CAMERAS, ball
 
-from station.calibration.detect.scene import static_view
+from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.detect.step_names import EMPTY
+from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
 from station.core.errors import CalibrationError
@@ -86,6 +87,41 @@ def test_a_file_from_elsewhere_is_kept_when_another_is_put_into_use(
     assert kept[0].rig.created == "2020-01-01T00:00:00Z"
     store.use("20200101T000000Z-found")
     assert store.scene() == {}
+
+
+def test_a_scan_is_not_compared_with_the_booth_of_another_calibration(
+    store: CalibrationStore,
+) -> None:
+    """A calibration that was put into use between two reads of one scan checked its own views with
+    the camera of the one before: this scan's, and all that followed."""
+    names = [_finished(store, day) for day in (1, 2)]
+    camera = _rig(1).cameras["front-lower"]
+    moved = replace(camera, K=camera.K * np.array([[1.01], [1.01], [1.0]]))
+    cameras = {**_rig(2).cameras, "front-lower": moved}
+    replace(_rig(2), cameras=cameras).save(store.folder / names[1] / "calibration.json")
+    store.use(names[0])
+    watch = DriftWatch(store)
+    watch.prepare(camera)
+    store.use(names[1])
+    with pytest.raises(CalibrationError, match="another calibration was put into use"):
+        watch.moves(camera, [np.full((480, 640), 20002, np.uint16)] * 2, 1e-4)
+    watch.prepare(moved)
+
+
+def test_a_calibration_that_is_put_into_use_while_another_is_read_is_noticed(
+    store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [_finished(store, day) for day in (1, 2)]
+    store.use(names[0])
+    scene = CalibrationStore.scene
+
+    def late(self: CalibrationStore) -> dict[str, StaticView]:
+        self.use(names[1])
+        return scene(self)
+
+    monkeypatch.setattr(CalibrationStore, "scene", late)
+    with pytest.raises(CalibrationError, match="another calibration was put into use"):
+        DriftWatch(store).prepare(_rig(1).cameras["front-lower"])
 
 
 def test_two_do_not_calibrate_at_once(store: CalibrationStore) -> None:

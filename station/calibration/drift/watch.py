@@ -20,6 +20,8 @@ from station.calibration.guide.store import CalibrationStore
 from station.core.errors import BoothError, CalibrationError
 from station.core.rig import CameraCalibration
 
+_CHANGED = "another calibration was put into use during this scan; scan again"
+
 
 class Doubts:
     """Alarms that wait for the next scan."""
@@ -47,6 +49,7 @@ class DriftWatch:
         self._store = store
         self._content = b""
         self._views: Mapping[str, StaticView] = {}
+        self._cameras: Mapping[str, CameraCalibration] = {}
         self._references: dict[str, DriftReference] = {}
         self._doubts = Doubts()
 
@@ -58,10 +61,16 @@ class DriftWatch:
         """Prepare the check of a camera, a quarter of a second, before a scan waits for it.
 
         Raises:
-            CalibrationError: the calibration's empty booth cannot be read.
+            CalibrationError: the calibration's empty booth cannot be read, or the camera is of
+                another calibration than the one in use.
         """
         self._follow()
-        if camera.name in self._views and camera.name not in self._references:
+        if camera.name not in self._views:
+            return
+        used = self._cameras.get(camera.name)
+        if used is None or used.to_json() != camera.to_json():
+            raise CalibrationError(_CHANGED)
+        if camera.name not in self._references:
             self._references[camera.name] = DriftReference.prepare(camera, self._views[camera.name])
 
     def moves(
@@ -70,8 +79,8 @@ class DriftWatch:
         """The camera's displacement from frames of one moment; empty where nothing was stored.
 
         Raises:
-            CalibrationError: the calibration's empty booth cannot be read, or the camera's images
-                are of another size than when it was calibrated.
+            CalibrationError: as `prepare`; or the camera's images are of another size than when it
+                was calibrated.
         """
         self.prepare(camera)
         view = self._views.get(camera.name)
@@ -92,10 +101,13 @@ class DriftWatch:
                 return
             self._references, self._views, self._content = {}, {}, b""
             self._doubts.forget()
-            self._views = self._store.scene()
-            self._content = content
+            views, cameras = self._store.scene(), self._store.rig_in_use().cameras
+            changed = self._store.in_use.read_bytes() != content
         except (BoothError, OSError) as error:
             raise CalibrationError(
                 f"this scan could not be checked for moved cameras ({error}); scan again; if it "
                 "happens again, run station calibrate"
             ) from None
+        if changed:
+            raise CalibrationError(_CHANGED)
+        self._views, self._cameras, self._content = views, cameras, content
