@@ -28,6 +28,15 @@ def test_a_command_in_a_message_is_named_as_its_button(page: Page, console: Live
     )
 
 
+def test_a_calibration_from_elsewhere_is_told(page: Page, console: LiveConsole) -> None:
+    """The page said that no calibration was stored yet, while scans were taken with one."""
+    open_view(page, console, "calibration")
+    told = page.get_by_text("came from elsewhere")
+    expect(told).to_be_visible(timeout=LONG_MS)
+    expect(told).to_contain_text("2026")
+    expect(page.get_by_text("No calibration is stored yet.")).to_have_count(0)
+
+
 def test_a_booth_that_takes_no_scans_says_so(page: Page, console: LiveConsole) -> None:
     """It looked healthy, and every scan was refused."""
     calibration = console.config.calibration

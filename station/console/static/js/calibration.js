@@ -108,7 +108,9 @@ export async function calibration(main, session) {
         shifts.length ? h('details', { className: 'small' }, h('summary', {}, t('cal.compare')), ...shifts.map((shift) =>
           h('div', {}, t('cal.shift', { camera: shift.camera, mm: shift.shift_mm, deg: shift.turn_deg })))) : '');
     }));
-    stored.replaceChildren(h('h2', {}, t('cal.stored')), ...(entries.length ? entries : [h('p', { className: 'soft' }, t('cal.none'))]));
+    const elsewhere = used ? '' : (await get('/booth')).calibration;
+    const words = elsewhere ? t('cal.elsewhere', { time: time(elsewhere) }) : entries.length ? '' : t('cal.none');
+    stored.replaceChildren(h('h2', {}, t('cal.stored')), words && h('p', { className: 'soft' }, words), ...entries);
   }
 
   async function use(one) {
