@@ -89,6 +89,7 @@ def test_a_job_that_is_compiled_first_says_so(
         ("while True: pass", "job", "not done after 5 s"),
         ("np.ones(10 << 27)", "job", "more than 2048 MB"),
         ("raise OSError(28, 'No space left on device')", "disk", "No space left"),
+        ("raise OSError(5, 'Input/output error', str(bundle / 'depth'))", "job", "Input/output"),
         ("raise ValueError('Out of range float values: nan')", "job", "ValueError"),
         ("raise DiskReadError('000.png cannot be read; scan again')", "job", "000.png"),
     ],

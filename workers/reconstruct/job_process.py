@@ -52,9 +52,10 @@ def main() -> None:
     if not line:
         return
     order = json.loads(line)
+    bundle = Path(order["bundle"])
     try:
         summary = reconstruct_bundle(
-            Path(order["bundle"]),
+            bundle,
             Path(order["out"]),
             method=order["method"],
             volume=Volume.model_validate(order["volume"]),
@@ -70,7 +71,9 @@ def main() -> None:
         _say(channel, {"error": str(error)})
         return
     except OSError as error:
-        _say(channel, {"disk": str(error)})
+        # Of the bundle's own folders only: as above.
+        here = Path(str(error.filename)).is_relative_to(bundle)
+        _say(channel, {"died" if here else "disk": str(error)})
         return
     except MemoryError:
         _say(channel, {"died": f"the job needed more than {MEMORY_BYTES >> 20} MB of memory"})
