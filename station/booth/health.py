@@ -25,7 +25,7 @@ from station.core.config_file import load_config
 from station.core.errors import BoothError
 from station.core.files import Version, version_of
 from station.core.rig import Rig
-from station.core.scans import CANCELLED, STATES, ScanId, count_scans, failure_reason, scans_of
+from station.core.scans import CANCELLED, STATES, count_scans, failure_reason, scans_of
 from station.core.service import NOTHING_RUNS, read_health
 from station.sensors.identity import calibrated_serials, configured_serials, mismatch
 
@@ -39,8 +39,6 @@ _CHANGED = (
 )
 _BESIDE_SCANS = ("console", "deliver")
 """Processes without which scans are taken and reconstructed all the same."""
-_STUCK_S = 60.0
-"""Time beyond its limit after which a claimed scan counts as stuck."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +53,7 @@ class BoothHealth:
     spool: dict[str, int]
     """Scans in each folder; failed/ has the cancelled ones, too."""
     oldest_waiting_s: float
-    stuck: list[ScanId]
+    stuck: list[str]
     """Claimed scans that should have ended."""
     free_bytes: int
     problems: list[str] = field(default_factory=list)
@@ -97,7 +95,11 @@ def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
     if words and words not in problems:
         problems.append(words)
     problems += problem_in_words(config)
-    spool, oldest_s, stuck, free = _disk(config, problems)
+    spool, oldest_s, free = _disk(config, problems)
+    # Workers count the time by a clock that nobody sets.
+    workers = processes.get("workers", {})
+    stuck = [str(name) for name in workers.get("stuck", [])] if reports(workers) else []
+    problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
     cancelled = _cancelled(config.spool.folder / "failed", spool.get("failed", 0))
     return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems, words, cancelled)
 
@@ -243,12 +245,12 @@ def _count_cancelled(failed: Path, changed_ns: int, count: int) -> int:  # noqa:
     return sum(failure_reason(folder) == CANCELLED for folder in failed.iterdir())
 
 
-def _entries(folder: Path) -> dict[ScanId, os.stat_result]:
-    """Scans in a folder of the spool, without those that leave it at this moment."""
-    found = {}
+def _moments_s(folder: Path) -> list[float]:
+    """Moments at which scans came into a folder, without those that leave it just now."""
+    found = []
     for name in scans_of(folder):
         with suppress(FileNotFoundError):
-            found[name] = (folder / name).stat()
+            found.append((folder / name).stat().st_mtime)
     return found
 
 
@@ -257,33 +259,26 @@ def _is_full(config: BoothConfig, free_bytes: int) -> bool:
     return free_bytes < config.spool.min_free_mb * 1e6
 
 
-def _disk(
-    config: BoothConfig, problems: list[str]
-) -> tuple[dict[str, int], float, list[ScanId], int]:
-    """Counts of scans, age of the oldest waiting one, stuck ones, free bytes."""
+def _disk(config: BoothConfig, problems: list[str]) -> tuple[dict[str, int], float, int]:
+    """Counts of scans, age of the oldest waiting one, free bytes."""
     folder = config.spool.folder
     if not folder.is_dir():
-        return {}, 0.0, [], 0
+        return {}, 0.0, 0
     try:
         counts = count_scans(folder)
         now_s = time.time()
-        waiting = [now_s - found.st_mtime for found in _entries(folder / "queue").values()]
-        limit_s = config.workers.timeout_s + _STUCK_S
-        claimed = _entries(folder / "work")
-        stuck = [name for name, found in claimed.items() if now_s - found.st_ctime > limit_s]
+        waiting_s = max([0.0, *(now_s - moment_s for moment_s in _moments_s(folder / "queue"))])
         free = shutil.disk_usage(folder).free
     except OSError as error:
         problems.append(f"the spool cannot be read ({error}); check its disk")
-        return {}, 0.0, [], 0
+        return {}, 0.0, 0
     if _is_full(config, free):
         problems.append(
             f"{folder} has {free / 1e6:.0f} MB free and scans are refused below "
             f"{config.spool.min_free_mb:.0f} MB; free some space or run: station purge --old"
         )
-    problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
     return (
         {state: counts.get(state, 0) for state in STATES if counts.get(state)},
-        max([0.0, *waiting]),
-        stuck,
+        waiting_s,
         free,
     )

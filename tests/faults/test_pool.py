@@ -207,6 +207,14 @@ def test_one_scan_that_stays_keeps_no_other(spool: Spool, monkeypatch: pytest.Mo
     assert not list((spool.folder / "tmp").iterdir())
 
 
+def test_a_scan_that_is_put_back_is_claimed_anew() -> None:
+    """A scan is stuck by the time since it was first seen in work."""
+    a, b = ScanId("a"), ScanId("b")
+    begun = pool.since({}, [a], 5.0)
+    assert pool.since(begun, [a, b], 9.0) == {a: 5.0, b: 9.0}
+    assert pool.since(pool.since(begun, [], 7.0), [a], 9.0) == {a: 9.0}
+
+
 @pytest.mark.parametrize("jump_days", [40.0, -40.0, -20000.0])
 def test_a_wall_clock_that_jumps_deletes_nothing(spool: Spool, jump_days: float) -> None:
     """A clock 40 days ahead, or a dead battery, deleted what had been scanned that day."""

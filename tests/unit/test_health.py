@@ -391,6 +391,22 @@ def test_what_is_no_scan_does_not_wait_in_the_queue(config: BoothConfig) -> None
     assert ScanIndex(spool).find() == []
 
 
+def test_workers_tell_what_is_stuck_by_a_clock_that_nobody_sets(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scan was said to be stuck where the clock was set while it was reconstructed."""
+    Spool(config.spool.folder).path("work", "a").mkdir()
+    tomorrow_s = time.time() + 86_400.0
+    monkeypatch.setattr("station.booth.health.time.time", lambda: tomorrow_s)
+    assert booth_health(config).stuck == []
+    _tell(config, "workers", stuck=["a"])
+    health = booth_health(config)
+    assert health.stuck == ["a"]
+    none = config.workers.model_copy(update={"count": 0})
+    assert booth_health(config.model_copy(update={"workers": none})).stuck == []
+    assert "scan a is stuck in work; see the workers' log" in health.problems
+
+
 def test_a_scan_that_moves_on_while_it_is_looked_at_is_no_fault(
     config: BoothConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

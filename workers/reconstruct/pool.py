@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,8 @@ _RECOVERY_PERIOD_S = 2.0
 _DISK_PAUSE_S = 1.0
 _SLACK_S = 60.0
 """Beyond the time limits of a job and its warm-up, before a worker counts as hanging."""
+_STUCK_S = 60.0
+"""Beyond a job's time limit, before its scan counts as stuck."""
 
 
 class _NoStartError(Exception):
@@ -200,11 +202,14 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
     workers = [Worker(config, spool, stop, log) for _ in range(config.workers.count)]
     heart.ready()
     recovered_s, problem = -_RECOVERY_PERIOD_S, ""
+    claimed_s: dict[ScanId, float] = {}
     while not stop.is_set():
         now_s = time.monotonic()
         if now_s - recovered_s >= _RECOVERY_PERIOD_S:
             recovered_s = now_s
             problem = _recover(config, spool, log)
+            with suppress(OSError):
+                claimed_s = since(claimed_s, spool.scans_in("work"), now_s)
         limit_s = WARM_UP_S + config.workers.timeout_s + _SLACK_S
         hanging = [w for w in workers if not w.thread.is_alive() or now_s - w.progress_s > limit_s]
         if not hanging:
@@ -214,6 +219,11 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
                 {
                     "busy": [w.scan_id for w in workers if w.scan_id],
                     "compiling": any(w.compiling for w in workers),
+                    "stuck": [
+                        scan_id
+                        for scan_id, begun_s in claimed_s.items()
+                        if now_s - begun_s > config.workers.timeout_s + _STUCK_S
+                    ],
                     "threads": sum(w.thread.is_alive() for w in workers),
                     "delivered": sum(w.delivered for w in workers),
                     "failed": sum(w.failed for w in workers),
@@ -225,6 +235,13 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
         stop.wait(_ROUND_S)
     for worker in workers:
         worker.thread.join()
+
+
+def since(
+    before: Mapping[ScanId, float], scans: Iterable[ScanId], now_s: float
+) -> dict[ScanId, float]:
+    """Moments at which each of the scans was first seen (pure)."""
+    return {scan_id: before.get(scan_id, now_s) for scan_id in scans}
 
 
 def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
