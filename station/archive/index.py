@@ -11,6 +11,7 @@ import json
 import os
 import sqlite3
 import time
+import unicodedata
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -23,7 +24,7 @@ from station.core.scans import ScanId, plain_label, scans_of
 from station.core.spool import Spool
 
 FILE = "index.sqlite"
-_VERSION = 1
+_VERSION = 2
 _BUSY_S, _PAUSE_S = 10.0, 0.01
 _SETTLED_NS = 50_000_000
 """A folder that changed this recently may change again within the same tick of its clock."""
@@ -85,11 +86,12 @@ class ScanIndex:
         where, values = ["1"], list[str | int]()
         if text:
             where.append("(instr(sought, ?) OR instr(lower(scan_id), ?))")
-            values += [text.casefold(), text.lower()]
+            values += [plain_label(text).casefold(), text.lower()]
         if label is not None:
             # Earlier versions kept labels as they were given.
-            where.append("label IN (?, ?)")
-            values += [label, plain_label(label)]
+            where.append("label IN (?, ?, ?)")
+            plain = plain_label(label)
+            values += [label, plain, unicodedata.normalize("NFD", plain)]
         if since:
             where.append("created >= ?")
             values.append(since)
@@ -205,7 +207,8 @@ class ScanIndex:
         database.execute(
             "INSERT OR REPLACE INTO scans VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
-                record.scan_id, place, record.state, record.label, record.label.casefold(),
+                record.scan_id, place, record.state, record.label,
+                plain_label(record.label).casefold(),
                 record.booth, record.created, record.finished,
                 json.dumps(record.reasons), json.dumps(dict(record.seconds)),
             ],

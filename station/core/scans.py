@@ -88,7 +88,8 @@ def is_scan_id(text: str) -> bool:
 
 def plain_label(text: str) -> str:
     """A label in one line, without control characters, as lists show it: what looks the same is
-    the same."""
+    the same, also where letters and their accents are spelled apart."""
+    text = unicodedata.normalize("NFC", text)
     return " ".join("".join(" " if unicodedata.category(c) == "Cc" else c for c in text).split())
 
 
@@ -319,11 +320,7 @@ class ScanFolders:
 
 
 def scans_of(folder: Path) -> list[ScanId]:
-    """Scan ids in a folder of a spool, oldest first; what is no scan's folder is left out.
-
-    Raises:
-        OSError: the folder cannot be read.
-    """
+    """Scan ids in a folder of a spool, oldest first; what is no scan's folder is left out."""
     with os.scandir(folder) as entries:
         return sorted(
             ScanId(entry.name)

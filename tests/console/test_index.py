@@ -12,6 +12,7 @@ import pytest
 
 from station.archive.index import FILE, IndexBusyError, ScanIndex
 from station.archive.records import ScanRecord
+from station.booth.deletion import labelled
 from station.core.files import write_json
 from station.core.spool import Spool
 
@@ -41,6 +42,19 @@ def test_scans_are_found_whatever_the_case_and_script(spool: Spool) -> None:
     assert failed.reasons == ("nobody there",)
     day = index.find(since="2026-11-21", until="2026-11-22")
     assert [scan.label for scan in day] == ["Order 1234"]
+
+
+@pytest.mark.parametrize("given", ["M\u00fcller", "Mu\u0308ller"])
+@pytest.mark.parametrize("asked", ["M\u00fcller", "Mu\u0308ller"])
+def test_accents_may_be_spelled_apart(spool: Spool, given: str, asked: str) -> None:
+    """An order that was pasted from a Mac was not found, nor deleted, by the same name."""
+    scan_id = "20261125T100000Z-0001"
+    spool.path("outbox", scan_id).mkdir()
+    write_json(spool.path("outbox", scan_id) / "result.json", {"label": given, "status": "ok"})
+    index = ScanIndex(spool)
+    assert [scan.scan_id for scan in index.find(asked.lower())] == [scan_id]
+    assert [scan.scan_id for scan in index.find(label=asked)] == [scan_id]
+    assert labelled(spool, asked) == [scan_id]
 
 
 def test_pages_hold_each_scan_once(spool: Spool) -> None:
