@@ -446,6 +446,18 @@ def test_status_shows_framesets_per_second(
         assert sync._health()["framesets_hz"] == 0.0
 
 
+def test_status_says_of_no_result_that_it_was_handed_over(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All were "handed over" to a target that nobody reached, once their scans were deleted."""
+    told = {**asdict(booth_health(config)), "streaming": False}
+    told["processes"] = {"deliver": {"waiting": {"orders": 0, "share": 2}, "age_s": 0.0}}
+    monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=told))
+    path = str(config.runtime.folder.parent / "booth.toml")
+    shown = CliRunner().invoke(status_cli.status, ["--config", path]).output
+    assert "deliver orders: nothing to hand over\ndeliver share: 2 to hand over\n" in shown
+
+
 def test_framesets_before_a_pause_do_not_count() -> None:
     times_s = [0.0, 0.1, 0.2, *(100.0 + np.arange(7) / 30)]
     assert rate_hz(times_s, 100.2) == pytest.approx(30.0)

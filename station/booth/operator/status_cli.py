@@ -98,7 +98,7 @@ def _show_status(content: Mapping[str, Any]) -> None:
     if streaming and "framesets_hz" in content["sync"]:
         click.echo(f"framesets: {content['sync']['framesets_hz']:.0f} per second")
     for name, count in content["processes"].get("deliver", {}).get("waiting", {}).items():
-        click.echo(f"deliver {name}: " + (f"{count} to hand over" if count else "all handed over"))
+        click.echo(f"deliver {name}: {count or 'nothing'} to hand over")
     counts = scans_by_outcome(content["spool"], content.get("cancelled", 0))
     free = f"; {content['free_bytes'] / 1e9:.1f} GB free" if content["free_bytes"] else ""
     click.echo(
