@@ -34,7 +34,7 @@ from station.calibration.detect.step_names import (
 from station.calibration.guide.seen import Lens, Seen
 from station.core.depth.intrinsics import check_intrinsics
 from station.core.errors import FormatError
-from station.core.files import fsync_folder, private_folder, read_json, write_json
+from station.core.files import fsync_folder, private_folder, read_json, utc_now, write_json
 from station.core.rig import CameraCalibration, Rig
 
 FORMAT = "booth-calibration-session"
@@ -83,10 +83,10 @@ class Session(Seen):
 
     @staticmethod
     def note_origin(folder: Path, adds_to: str) -> None:
-        """Note in a folder which stored calibration it was copied from."""
+        """Note in a folder which stored calibration it was copied from, just now."""
         path = folder / SESSION
         document = read_json(path, format=FORMAT, versions=VERSIONS)
-        write_json(path, {**document, "adds_to": adds_to})
+        write_json(path, {**document, "adds_to": adds_to, "started": utc_now()})
 
     @staticmethod
     def begun(folder: Path) -> str:
