@@ -320,7 +320,8 @@ class ScanFolders:
 
 
 def scans_of(folder: Path) -> list[ScanId]:
-    """Scan ids in a folder of a spool, oldest first; what is no scan's folder is left out."""
+    """Scan ids in a folder of a spool, oldest first, without what is no scan's folder; an OSError
+    where the folder cannot be read."""
     with os.scandir(folder) as entries:
         return sorted(
             ScanId(entry.name)
