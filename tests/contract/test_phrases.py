@@ -44,7 +44,7 @@ SPEAKERS = (
     "station/calibration/solve/solution.py", "station/calibration/solve/solving.py",
     "station/calibration/solve/first_problem.py", "station/calibration/solve/advice.py",
     "station/calibration/solve/acceptance.py",
-    "station/calibration/solve/world.py",
+    "station/calibration/solve/warming.py", "station/calibration/solve/world.py",
     "station/calibration/solve/predicted.py", "station/calibration/detect/coverage.py",
     "station/sensors/freenect.py", "station/sensors/identity.py", "station/sensors/recorded.py",
     "station/sensors/recording.py",

@@ -180,6 +180,8 @@ class Observations:
     planes: Sequence[PlaneObservation] = field(default_factory=tuple)
     around: Mapping[str, Sequence[BallDetection]] = field(default_factory=dict)
     """The ball resting elsewhere: name of the place -> detections."""
+    depth_changes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Step -> camera -> relative change of its depths since the empty booth was recorded."""
 
     @classmethod
     def merged(cls, parts: Iterable[Self]) -> Self:
@@ -194,6 +196,14 @@ class Observations:
             around={
                 place: [one for part in listed for one in part.around.get(place, ())]
                 for place in places
+            },
+            depth_changes={
+                step: {
+                    camera: change
+                    for part in listed
+                    for camera, change in part.depth_changes.get(step, {}).items()
+                }
+                for step in dict.fromkeys(step for part in listed for step in part.depth_changes)
             },
         )
 

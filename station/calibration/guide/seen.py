@@ -54,6 +54,8 @@ class Seen:
     """Step -> the surfaces seen in it."""
     around: dict[str, list[BallDetection]] = field(default_factory=dict)
     """Place -> the ball resting there: on the floor, on a stand, or hanging."""
+    depth_changes: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Step -> camera -> relative change of its depths since the empty booth was recorded."""
     lenses: dict[str, Lens] = field(default_factory=dict)
     adds_to: str = ""
     """Name of the stored calibration that was taken up again."""
@@ -100,7 +102,9 @@ class Seen:
     def observations(self) -> Observations:
         """The observations that the calibration is solved from."""
         planes = [plane for seen in self.planes.values() for plane in seen]
-        return Observations(self.balls, self.mark, self.front, planes, self.around)
+        return Observations(
+            self.balls, self.mark, self.front, planes, self.around, self.depth_changes
+        )
 
     def done(self, step: str) -> bool:
         """True once a step is finished (waving never is: more of it always helps)."""

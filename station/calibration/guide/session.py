@@ -46,6 +46,8 @@ Observed = TypeVar("Observed", BallDetection, PlaneObservation)
 
 _FORGET_RAISED, _REPLAYED, _BALL_AGAIN = "forget-raised", "ball-replayed", "ball-again"
 _RUN, _RUN_AGAIN = "run", "run-again"
+_DEPTHS = "depth_changes"
+"""Field of an entry: camera -> relative change of its depths since the empty booth."""
 _FORGET_BALLS = "forget-balls"
 """Entry of earlier versions, which forgot the waved ball before it was seen anew."""
 _NO_ENTRY = (
@@ -143,13 +145,25 @@ class Session(Seen):
             view.save(private_folder(self.folder / SCENE) / f"{camera}.npz")
         self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
 
+    def note_depths(self, step: str, camera: str, change: float) -> None:
+        """Note how a camera's depths have changed (relative) since the empty booth was recorded;
+        on disk with the step."""
+        self.depth_changes.setdefault(step, {})[camera] = change
+
     def record_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
         """A flat board at one place ("wall-0", "wall-1", ...)."""
-        self._append({"step": place, "planes": [plane.to_json() for plane in planes]})
+        seen = {"step": place, "planes": [plane.to_json() for plane in planes]}
+        self._append({**seen, **self._noted_depths(place)})
 
     def record_resting(self, step: str, balls: Sequence[BallDetection]) -> None:
         """The ball on the mark (MARK), in front of it (FRONT) or elsewhere ("around-0", ...)."""
-        self._append({"step": step, "balls": [ball.to_json() for ball in balls]})
+        seen = {"step": step, "balls": [ball.to_json() for ball in balls]}
+        self._append({**seen, **self._noted_depths(step)})
+
+    def _noted_depths(self, step: str) -> dict[str, Any]:
+        """The step's part of its line on the depths; nothing where they were not seen."""
+        changes = self.depth_changes.get(step)
+        return {_DEPTHS: changes} if changes else {}
 
     def begin_run(self, *, again: bool = False) -> None:
         """Start another run of waving, whose times are unrelated to those before; ``again``: it is
@@ -261,6 +275,12 @@ class Session(Seen):
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
+        if step == EMPTY:
+            # What follows is compared with this one.
+            self.depth_changes.clear()
+        for name, change in entry.get(_DEPTHS, {}).items():
+            self._check_camera(str(name))
+            self.note_depths(step, str(name), float(finite_numbers(change, ())))
 
     def _take_run(self, seen: Sequence[BallDetection]) -> None:
         later_s = self._moved_by(min(ball.time_s for ball in seen))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -12,15 +13,17 @@ from numpy.typing import NDArray
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.detect.scene import smoothed, static_view
+from station.calibration.detect.scene import static_view
 from station.calibration.detect.step_names import HANGING, WALL, numbered_step
+from station.calibration.detect.stillness import check_board_stands, check_stillness
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
-from station.calibration.guide.feed import Feed, gather_frames
+from station.calibration.detect.warmth import depth_change
+from station.calibration.guide.feed import Feed, TimedFrame, gather_frames
 from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.seen import Seen
 from station.calibration.guide.session import Session
-from station.core.depth.images import Image, inverse_depth
+from station.core.depth.images import Image
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
@@ -45,17 +48,9 @@ _WRITE_EVERY_S = 1.0
 _LOOK_EVERY_S = 0.2
 _MANY_WAIT = 60
 """Frames, of all cameras, after which what is said of the coverage lags by more than a second."""
-_OFTEN = 0.9
-_MOVED_PER_M, _MOVED_SHARE = 0.01, 0.002
-"""An empty booth in which more of an image changes by more than that, 1/m, is not empty."""
-_SEES_SOMETHING = 0.02
-"""Share of an image with steady readings below which a camera is covered."""
-_BOARD_PARTS, _BOARD_MOVED_PER_M, _BOARD_MOVED_SHARE = 5, 0.004, 0.25
-"""A board more of which differs by more than that between any two parts of the time, 1/m, is not
-standing: 12 mm at 1.7 m, 25 at 2.5."""
-_BOARD_OFFSETS_PX = np.array([-4, 0, 4])
-"""Around the middle of a cell: nine readings that err independently. With one, before a sensor of
-twice the noise, up to a third of a standing board seemed to move."""
+_DEPTH_FRAMES = 12
+"""Last frames of a step of the ball at rest, in which the depths of the booth are compared with
+those of the empty one."""
 
 
 def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
@@ -66,7 +61,7 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
     """
     taken = _frames(feed, session, guide, _EMPTY_FRAMES)
     for name, (stack, scale_m) in taken.items():
-        _check_stillness(name, stack, scale_m)
+        check_stillness(name, stack, scale_m)
     cameras = session.lensed_cameras()
     floors = [
         floor
@@ -101,13 +96,15 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
             raise CalibrationError(EMPTY_FIRST)
         wall = observe_wall(stack, scale_m, cameras[camera], name, background)
         if wall is not None:
-            _check_board_stands(wall, stack, scale_m)
+            check_board_stands(wall, stack, scale_m)
             walls.append(wall)
     if not walls:
         raise CalibrationError(
             "no camera sees a flat board that stands still: put it upright, facing the cameras, "
             "1 m or more wide, and stand beside it, not before it"
         )
+    for camera, (stack, scale_m) in taken.items():
+        _note_depths(session, name, camera, stack, scale_m)
     session.record_wall(name, walls)
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
@@ -123,38 +120,6 @@ def _frames(
     }
 
 
-def _check_stillness(name: str, stack: NDArray[np.uint16], scale_m: float) -> None:
-    before, after = (static_view(iter(half), scale_m) for half in np.array_split(stack, 2))
-    both = (before.share > _OFTEN) & (after.share > _OFTEN)
-    if both.mean() < _SEES_SOMETHING:
-        raise CalibrationError(
-            f"camera {name} sees nothing: take away what covers it and do it again"
-        )
-    surface, surface_after = (smoothed(v.inverse_depth, v.share)[0] for v in (before, after))
-    change = np.abs(surface - surface_after)[both]
-    if float(np.mean(change > _MOVED_PER_M)) > _MOVED_SHARE:
-        raise CalibrationError(
-            f"something moved in front of camera {name}; leave the booth and do it again"
-        )
-
-
-def _check_board_stands(board: PlaneObservation, stack: NDArray[np.uint16], scale_m: float) -> None:
-    """Compare the middles of the board's cells over time: it may have moved, and come back."""
-    column, row = np.rint(board.patches[:, :2]).astype(int).T
-    rows = (row + _BOARD_OFFSETS_PX[:, None, None]).clip(0, stack.shape[1] - 1)
-    columns = (column + _BOARD_OFFSETS_PX[:, None]).clip(0, stack.shape[2] - 1)
-    parts = []
-    for part in np.array_split(stack, _BOARD_PARTS):
-        inverse = inverse_depth(scale_m * part[:, rows, columns]).reshape(-1, len(row))
-        count = (inverse > 0.0).sum(axis=0)
-        parts.append(np.where(count > 0, inverse.sum(axis=0) / np.maximum(count, 1), np.nan))
-    change = np.fmax.reduce(parts) - np.fmin.reduce(parts)
-    if float(np.mean(change > _BOARD_MOVED_PER_M)) > _BOARD_MOVED_SHARE:
-        raise CalibrationError(
-            f"the board moved in front of camera {board.camera}; stand it firmly and do it again"
-        )
-
-
 def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[BallDetection]:
     """Wait until the ball lies still where it was put: its detections there.
 
@@ -163,12 +128,16 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
     """
     hangs = step.startswith(HANGING)
     recent: dict[str, list[BallDetection]] = {name: [] for name in session.cameras}
+    last = {name: deque[TimedFrame](maxlen=_DEPTH_FRAMES) for name in session.cameras}
     still: dict[str, list[BallDetection]] = {}
     now_s = time.monotonic()
     give_up_s, settled_s = now_s + _RESTING_S, np.inf
     with BallFinder(session, every_frame=feed.replays, held=False) as finder:
         while now_s < min(give_up_s, settled_s) and not feed.over:
-            finder.submit(feed.newest())
+            newest = feed.newest()
+            for frame in newest:
+                last[frame.camera].append(frame)
+            finder.submit(newest)
             for ball in finder.found():
                 recent[ball.camera].append(ball)
             still = _at_rest(recent, LOOK_S if hangs else None)
@@ -189,6 +158,10 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
             "(calibrate.ball_radius_m)"
             + ("; a recording of it has to last 3 s or longer" if feed.replays else "")
         )
+    for camera, frames in last.items():
+        if frames:
+            pixels = (frame.pixels() for frame in frames)
+            _note_depths(session, step, camera, pixels, frames[0].scale_m)
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
 
@@ -342,6 +315,16 @@ def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
     behind = f"; {waiting} frames are still to be looked at" if waiting > _MANY_WAIT else ""
     return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
+
+
+def _note_depths(
+    session: Session, step: str, camera: str, frames: Iterable[NDArray[np.uint16]], scale_m: float
+) -> None:
+    """Note how a camera's depths have changed since the empty booth was recorded, if they show."""
+    empty = session.background(camera)
+    change = None if empty is None else depth_change(frames, scale_m, empty)
+    if change is not None:
+        session.note_depths(step, camera, change)
 
 
 def _background(session: Session, camera: str) -> Image | None:

@@ -19,7 +19,7 @@ from station.calibration.adjust.problem import ROUND, Problem, State
 from station.calibration.adjust.sensor_model import COARSE, SensorModel
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import Observations
-from station.calibration.solve import acceptance, refusals, resting_ball, world
+from station.calibration.solve import acceptance, refusals, resting_ball, warming, world
 from station.calibration.solve.acceptance import HeldOut
 from station.calibration.solve.advice import advice, boarded
 from station.calibration.solve.first_problem import first_problem
@@ -74,6 +74,7 @@ def solve(
         refusals.check_counts(coverage)
         measured_m = refusals.check_radius(observations.balls, radius_m)
         refusals.check_rest(observations, front_cameras)
+        warming.check_warm(observations.depth_changes)
         progress("finding the relative positions of the cameras")
         problem, poses = first_problem(observations, cameras, radius_m, reference)
         if words := resting_ball.height_words(problem, first_state(problem, poses)):
@@ -93,10 +94,13 @@ def solve(
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
+        predicted = warming.widen_by_warming(predicted, observations.depth_changes)
         heights_m = problem.heights_m.values()
         refusals.check_predicted(predicted, limits, coverage, heights_m, boarded(problem))
         rig = replace(rig, predicted=predicted)
         weak = advice(problem, state, predicted, world_poses, limits, coverage)
+        if words := warming.warming_words(observations.depth_changes):
+            weak = (words, *weak)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
 
 
