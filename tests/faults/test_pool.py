@@ -207,12 +207,21 @@ def test_one_scan_that_stays_keeps_no_other(spool: Spool, monkeypatch: pytest.Mo
     assert not list((spool.folder / "tmp").iterdir())
 
 
-def test_a_scan_that_is_put_back_is_claimed_anew() -> None:
-    """A scan is stuck by the time since it was first seen in work."""
-    a, b = ScanId("a"), ScanId("b")
-    begun = pool.since({}, [a], 5.0)
-    assert pool.since(begun, [a, b], 9.0) == {a: 5.0, b: 9.0}
-    assert pool.since(pool.since(begun, [], 7.0), [a], 9.0) == {a: 9.0}
+def test_a_scan_that_is_put_back_is_claimed_anew(spool: Spool) -> None:
+    """One whose job had hung and was tried again at once was said to be stuck during the second
+    try: it had been in work at every look."""
+    spool.path("queue", "a").mkdir()
+    claim = spool.claim()
+    assert claim is not None
+    begun = pool.since({}, pool.claimed(spool), 5.0)
+    assert list(pool.since(begun, pool.claimed(spool), 9.0).values()) == [5.0]
+    time.sleep(0.1)  # the file system's clock ticks
+    claim.put_back()
+    claim.close()
+    again = spool.claim()
+    assert again is not None
+    assert list(pool.since(begun, pool.claimed(spool), 9.0).values()) == [9.0]
+    again.close()
 
 
 @pytest.mark.parametrize("jump_days", [40.0, -40.0, -20000.0])

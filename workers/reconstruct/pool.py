@@ -42,6 +42,9 @@ _SLACK_S = 60.0
 _STUCK_S = 60.0
 """Beyond a job's time limit, before its scan counts as stuck."""
 
+Claimed = tuple[ScanId, int]
+"""A scan in work, and the change of its folder by the rename that claimed it."""
+
 
 class _NoStartError(Exception):
     """No process for a job can be started; the scan waits."""
@@ -202,14 +205,14 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
     workers = [Worker(config, spool, stop, log) for _ in range(config.workers.count)]
     heart.ready()
     recovered_s, problem = -_RECOVERY_PERIOD_S, ""
-    claimed_s: dict[ScanId, float] = {}
+    claimed_s: dict[Claimed, float] = {}
     while not stop.is_set():
         now_s = time.monotonic()
         if now_s - recovered_s >= _RECOVERY_PERIOD_S:
             recovered_s = now_s
             problem = _recover(config, spool, log)
             with suppress(OSError):
-                claimed_s = since(claimed_s, spool.scans_in("work"), now_s)
+                claimed_s = since(claimed_s, claimed(spool), now_s)
         limit_s = WARM_UP_S + config.workers.timeout_s + _SLACK_S
         hanging = [w for w in workers if not w.thread.is_alive() or now_s - w.progress_s > limit_s]
         if not hanging:
@@ -221,7 +224,7 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
                     "compiling": any(w.compiling for w in workers),
                     "stuck": [
                         scan_id
-                        for scan_id, begun_s in claimed_s.items()
+                        for (scan_id, _), begun_s in claimed_s.items()
                         if now_s - begun_s > config.workers.timeout_s + _STUCK_S
                     ],
                     "threads": sum(w.thread.is_alive() for w in workers),
@@ -237,11 +240,20 @@ def serve(config: BoothConfig, stop: threading.Event, log: logging.Logger) -> No
         worker.thread.join()
 
 
+def claimed(spool: Spool) -> list[Claimed]:
+    """Scans in work. One that was put back and claimed again between two looks is another one."""
+    found = []
+    for scan_id in spool.scans_in("work"):
+        with suppress(FileNotFoundError):
+            found.append((scan_id, spool.path("work", scan_id).stat().st_ctime_ns))
+    return found
+
+
 def since(
-    before: Mapping[ScanId, float], scans: Iterable[ScanId], now_s: float
-) -> dict[ScanId, float]:
-    """Moments at which each of the scans was first seen (pure)."""
-    return {scan_id: before.get(scan_id, now_s) for scan_id in scans}
+    before: Mapping[Claimed, float], claims: Iterable[Claimed], now_s: float
+) -> dict[Claimed, float]:
+    """Moments at which each of the claims was first seen (pure)."""
+    return {claim: before.get(claim, now_s) for claim in claims}
 
 
 def _recover(config: BoothConfig, spool: Spool, log: logging.Logger) -> str:
