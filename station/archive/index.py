@@ -25,6 +25,8 @@ from station.core.spool import Spool
 
 FILE = "index.sqlite"
 _VERSION = 2
+_OF_OTHER_TEXTS = 1
+"""Version with the same tables, in which labels are sought as they were given."""
 _BUSY_S, _PAUSE_S = 10.0, 0.01
 _SETTLED_NS = 50_000_000
 """A folder that changed this recently may change again within the same tick of its clock."""
@@ -157,9 +159,11 @@ class ScanIndex:
             # Labels of purged scans must not stay behind in the file's free pages.
             database.execute("PRAGMA secure_delete = ON")
             found = database.execute("PRAGMA user_version").fetchone()[0]
-            if found not in (0, _VERSION):
+            if found not in (0, _OF_OTHER_TEXTS, _VERSION):
                 raise sqlite3.DatabaseError(f"version {found}")
             database.executescript(_SCHEMA)
+            if found == _OF_OTHER_TEXTS:
+                _empty(database)
             if found == 0:
                 # Only once: whoever writes waits for all others who do.
                 database.execute(f"PRAGMA user_version = {_VERSION}")
@@ -243,6 +247,20 @@ def _share(database: sqlite3.Connection) -> None:
             if not busy or time.monotonic() > deadline_s:
                 raise
         time.sleep(_PAUSE_S)
+
+
+def _empty(database: sqlite3.Connection) -> None:
+    """Let an older version's rows be read anew from the folders.
+
+    Its file stays: the booth's processes start at the same time, and one that replaced it would
+    take it away from the others.
+    """
+    with _transaction(database):
+        # Another process may have done so meanwhile.
+        if database.execute("PRAGMA user_version").fetchone()[0] == _OF_OTHER_TEXTS:
+            database.execute("DELETE FROM scans")
+            database.execute("DELETE FROM folders")
+            database.execute(f"PRAGMA user_version = {_VERSION}")
 
 
 @contextmanager

@@ -85,6 +85,20 @@ def test_an_index_with_damaged_pages_is_made_anew(spool: Spool) -> None:
     assert _labels(ScanIndex(spool), "order 1234") == ["Order 1234"]
 
 
+def test_an_index_of_the_version_before_is_read_anew_in_its_place(spool: Spool) -> None:
+    """All processes start at once after an upgrade; each removed the file that another had just
+    made, with the log that this one wrote to."""
+    index, path = ScanIndex(spool), spool.folder / FILE
+    index.find()
+    with closing(sqlite3.connect(path, isolation_level=None)) as before:
+        before.execute("UPDATE scans SET sought = 'as it was given'")
+        before.execute("PRAGMA user_version = 1")
+        file = path.stat().st_ino
+        assert _labels(index, "order 1234") == ["Order 1234"]
+        assert before.execute("PRAGMA user_version").fetchone() == (2,)
+    assert path.stat().st_ino == file
+
+
 def test_a_locked_index_is_not_thrown_away(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever held the file open lost it, and answered the next request with a server error."""
     index = ScanIndex(spool)
