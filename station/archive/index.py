@@ -11,7 +11,6 @@ import json
 import os
 import sqlite3
 import time
-import unicodedata
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -79,7 +78,7 @@ class ScanIndex:
 
         Args:
             text: text that the label or the scan id contains, ignoring case.
-            label: the whole label, exactly.
+            label: the whole label, as lists show it.
             since, until: bounds of `created`, ISO 8601, the second one excluded.
             states: any of them; all if empty.
             before: (created, scan_id) of the last scan of the previous page.
@@ -91,9 +90,9 @@ class ScanIndex:
             values += [plain_label(text).casefold(), text.lower()]
         if label is not None:
             # Earlier versions kept labels as they were given.
-            where.append("label IN (?, ?, ?)")
+            where.append("sought = ? AND plain_label(label) = ?")
             plain = plain_label(label)
-            values += [label, plain, unicodedata.normalize("NFD", plain)]
+            values += [plain.casefold(), plain]
         if since:
             where.append("created >= ?")
             values.append(since)
@@ -153,6 +152,7 @@ class ScanIndex:
             self._path, timeout=_BUSY_S, isolation_level=None, check_same_thread=not shared
         )
         try:
+            database.create_function("plain_label", 1, plain_label, deterministic=True)
             _share(database)
             # The folders are what lasts: nobody waits for the disk for the sake of this cache.
             database.execute("PRAGMA synchronous = NORMAL")
