@@ -277,8 +277,11 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
 def _names(folder: Path) -> list[ScanId]:
     try:
         return scans_of(folder)
-    except OSError:
+    except FileNotFoundError:
         return []
+    except OSError as error:
+        # Its scans would be missing until the folder changes, also where others wait for them.
+        raise sqlite3.OperationalError(f"{folder}: {error.strerror}") from None
 
 
 def _record(row: tuple[str, ...]) -> ScanRecord:

@@ -1,5 +1,6 @@
 """Index of scans, which follows the folders alone."""
 
+import errno
 import os
 import re
 import shutil
@@ -14,6 +15,7 @@ from station.archive.index import FILE, IndexBusyError, ScanIndex
 from station.archive.records import ScanRecord
 from station.booth.deletion import labelled
 from station.core.files import write_json
+from station.core.scans import ScanId, scans_of
 from station.core.spool import Spool
 
 
@@ -156,6 +158,24 @@ def _locks(path: Path) -> list[str]:
     words = {str(os.getpid()), str(path.stat().st_ino)}
     lines = Path("/proc/locks").read_text().splitlines()
     return sorted(line.split(":", 1)[1] for line in lines if words <= set(re.split("[ :]", line)))
+
+
+def test_a_folder_that_cannot_be_listed_once_loses_no_scans(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process with too many open files listed none, and neither did those after it."""
+    index = ScanIndex(spool)
+
+    def refused(folder: Path) -> list[ScanId]:
+        if folder.name == "outbox":
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return scans_of(folder)
+
+    monkeypatch.setattr("station.archive.index.scans_of", refused)
+    with pytest.raises(IndexBusyError, match="outbox: Too many open files"):
+        index.find()
+    monkeypatch.undo()
+    assert len(index.find()) == 4
 
 
 def test_many_readers_at_once(spool: Spool) -> None:
