@@ -401,10 +401,32 @@ def test_cameras_that_share_unseen_directions_are_told_together(
     *first, last = moves[0].unseen_words()
     words = f"{', '.join(first)} or {last}" if first else last
     assert "shift sideways" in words
-    check_cli._tell(moves, [], moved=False)
+    check_cli._tell(moves, [], {}, moved=False)
     assert capsys.readouterr().out.splitlines() == [
         *(f"camera {name} stands where it was calibrated" for name in "abc"),
         f"  cameras a, c: a small {words} cannot be detected",
         "  a fixed post or corner in a camera's view would make it possible",
         "the booth is in order: no camera has moved, as far as their views can show",
     ]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (9e-4, "0.09 % farther away than when they were calibrated: girths come out about 6 mm too "
+         "small"),
+        (-7e-4, "0.07 % nearer than when they were calibrated: girths come out about 5 mm too "
+         "large"),
+        (4e-4, ""),
+    ],
+)  # fmt: skip
+def test_depths_that_changed_are_told(
+    capsys: pytest.CaptureFixture[str], change: float, words: str
+) -> None:
+    """Girths were 7 mm off where nothing showed it."""
+    moves = [CameraMove(name, np.zeros(6), 1e-8 * np.eye(6), 1.0) for name in "abcd"]
+    depths = {"a": change, "b": change + 1e-5, "c": change, "d": 4e-3}
+    check_cli._tell(moves, [], depths, moved=False)
+    out = capsys.readouterr().out
+    assert ("all cameras see the booth" in out) == bool(words)
+    assert words in out

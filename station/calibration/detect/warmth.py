@@ -7,7 +7,7 @@ noise, so that their readings show a change of a few hundredths of a per cent.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,12 @@ def depth_change(
     if known.sum() < _FEWEST_BLOCKS:
         return None
     return float(np.median(changed[known] / level[known]))
+
+
+def common_change(changes: Mapping[str, float]) -> float:
+    """The change that cameras (name -> change) have in common, whatever one of them shows; 0 where
+    none shows any."""
+    return float(np.median([*changes.values()])) if changes else 0.0
 
 
 def _in_blocks(image: NDArray[np.generic]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from station.calibration.detect.warmth import common_change, depth_change
 from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.last_check import keep_check
@@ -30,6 +31,8 @@ _FRAMES = 30
 _SENSORS_S = 20.0
 _EXIT_MOVED = 3
 _EXIT_CHANGED = 4
+_CHANGED_DEPTHS, _CHANGE_PER_MM = 5e-4, 1.4e-4
+"""Change of all depths that is told, and the one by which girths come out a millimetre off."""
 
 
 @click.command()
@@ -64,13 +67,13 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     if correct:
         _correct(config)
         return
-    moves = _moves(config, recordings, quiet=as_json)
+    moves, depths = _moves(config, recordings, quiet=as_json)
     changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
     if as_json:
-        click.echo(json.dumps([_document(move) for move in moves]))
+        click.echo(json.dumps([_document(move, depths.get(move.camera)) for move in moves]))
     else:
-        _tell(moves, changed, moved=moved)
+        _tell(moves, changed, depths, moved=moved)
     if recordings is None:
         try:
             keep_check(config.console.folder, moves)
@@ -97,8 +100,11 @@ def _correct(config: BoothConfig) -> None:
     )
 
 
-def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[CameraMove]:
-    """Estimates of how far each camera stands from where it was calibrated.
+def _moves(
+    config: BoothConfig, recordings: Path | None, quiet: bool
+) -> tuple[list[CameraMove], dict[str, float]]:
+    """Estimates of how far each camera stands from where it was calibrated, and relative changes of
+    its depths by camera, where they show.
 
     Raises:
         CalibrationError: cameras or sensors are not those of the calibration, or its picture of
@@ -118,22 +124,28 @@ def _moves(config: BoothConfig, recordings: Path | None, quiet: bool) -> list[Ca
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
         taken = _look(feed, rig, names, quiet)
-    return [
-        estimate_move(
-            DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name]),
-            [frame.pixels() for frame in frames],
-            frames[0].scale_m,
-        )
-        for name, frames in taken.items()
-    ]
+    moves, depths = list[CameraMove](), dict[str, float]()
+    for name, frames in taken.items():
+        pixels, scale_m = [frame.pixels() for frame in frames], frames[0].scale_m
+        camera = rig.camera(name, str(config.calibration))
+        moves.append(estimate_move(DriftReference.prepare(camera, scene[name]), pixels, scale_m))
+        if (change := depth_change(pixels, scale_m, scene[name])) is not None:
+            depths[name] = change
+    return moves, depths
 
 
-def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) -> None:
+def _tell(
+    moves: list[CameraMove],
+    changed: list[CameraMove],
+    depths: Mapping[str, float],
+    *,
+    moved: bool,
+) -> None:
     for move in moves:
         click.echo(move.words())
     for line in _unseen_lines(moves):
         click.echo(f"  {line}")
-    if words := depths_words(moves):
+    if words := depths_words(moves) or _depths_line(depths):
         click.echo(words)
     if changed:
         most = min(changed, key=lambda move: move.share)
@@ -145,6 +157,20 @@ def _tell(moves: list[CameraMove], changed: list[CameraMove], *, moved: bool) ->
         )
     elif not moved:
         click.echo("the booth is in order: no camera has moved, as far as their views can show")
+
+
+def _depths_line(depths: Mapping[str, float]) -> str:
+    """Line on depths that all cameras see changed; "" where they are as at the calibration."""
+    change = common_change(depths)
+    if abs(change) <= _CHANGED_DEPTHS:
+        return ""
+    return (
+        f"all cameras see the booth {100.0 * abs(change):.2f} % "
+        f"{'farther away' if change > 0.0 else 'nearer'} than when they were calibrated: girths "
+        f"come out about {abs(change) / _CHANGE_PER_MM:.0f} mm too "
+        f"{'small' if change > 0.0 else 'large'}; let the sensors warm up for 20 minutes, and "
+        "check again; if nothing changes, run station calibrate"
+    )
 
 
 def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
@@ -183,7 +209,7 @@ def _look(feed: Feed, rig: Rig, names: list[str], quiet: bool) -> dict[str, list
     return taken
 
 
-def _document(move: CameraMove) -> dict[str, object]:
+def _document(move: CameraMove, depth_change: float | None) -> dict[str, object]:
     return {
         "camera": move.camera,
         "moved": move.moved,
@@ -193,5 +219,6 @@ def _document(move: CameraMove) -> dict[str, object]:
         "translation_m": move.xi[3:].tolist(),
         "sigma": np.sqrt(np.diag(move.stated)).tolist(),
         "background_share": move.share,
+        "depth_change": depth_change,
         "unseen": move.unseen_words(),
     }

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
+from station.calibration.detect.warmth import common_change
 from station.core.errors import CalibrationError
 from station.core.rig import PredictedError
 
@@ -58,7 +57,7 @@ def widen_by_warming(predicted: PredictedError, changes: Changes) -> PredictedEr
 def _largest(changes: Changes) -> float:
     """The change between any two steps, the empty booth among them, that all cameras show: the
     later less the earlier, where the empty booth is the earliest."""
-    common = [0.0, *(float(np.median([*seen.values()])) for seen in changes.values() if seen)]
+    common = [0.0, *map(common_change, changes.values())]
     low, high = min(common), max(common)
     return high - low if high >= -low else low - high
 
