@@ -130,10 +130,10 @@ class HandOver:
         """Hand over the results that are due to one target."""
         mine = [entry for entry in self._ledger.waiting() if entry.target == name]
         due = [entry for entry in mine if entry.due(now_s)]
-        received = False
+        received, began_s = False, time.monotonic()
         for entry in due:
             self._round_s[name] = time.monotonic()
-            received |= self._try(entry)
+            received |= self._try(entry, now_s + time.monotonic() - began_s)
             self._settle(entry)
         if received:
             # The others need not wait as long as after their own failures.
@@ -153,20 +153,22 @@ class HandOver:
             self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
         self._ledger.forget(entry.scan_id)
 
-    def _try(self, entry: Waiting) -> bool:
+    def _try(self, entry: Waiting, now_s: float) -> bool:
         """Hand one result over; whether the target has received it."""
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
             return False
+        began_s = time.monotonic()
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
-            self._postpone(entry, str(error))
+            self._postpone(entry, str(error), now_s + time.monotonic() - began_s)
             return False
         except Exception as error:
             # One result that is damaged must not keep the others from being handed over.
             self._log.exception("handing over %s", entry.scan_id, extra={"scan": entry.scan_id})
-            self._postpone(entry, f"{type(error).__name__}: {error}")
+            words = f"{type(error).__name__}: {error}"
+            self._postpone(entry, words, now_s + time.monotonic() - began_s)
             return False
         self._ledger.finish(entry)
         self._log.info(
@@ -174,14 +176,13 @@ class HandOver:
         )
         return True
 
-    def _postpone(self, entry: Waiting, reason: str) -> None:
+    def _postpone(self, entry: Waiting, reason: str, ended_s: float) -> None:
         # From the end of the try: a slow receiver would get the next one without a pause.
-        now_s = time.time()
-        after = entry.failed(reason, now_s)
+        after = entry.failed(reason, ended_s)
         self._ledger.keep(after)
         self._log.warning(
             "%s not handed over to %s (%s); retrying in %.0f s",
-            entry.scan_id, entry.target, reason, after.next_s - now_s,
+            entry.scan_id, entry.target, reason, after.next_s - ended_s,
             extra={"scan": entry.scan_id},
         )  # fmt: skip
 

@@ -41,6 +41,8 @@ from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from workers.measure.definitions import DEFINITIONS
 from workers.reconstruct.measure_cli import measure
 
+_TIMELY_S = 5.0
+"""A try against this machine takes less."""
 _DOCUMENT: dict[str, Any] = {
     "format": "booth-measurements", "version": 1, "pose": "as-scanned",
     "measurements": [
@@ -295,12 +297,13 @@ def test_a_webhook_is_tried_until_it_takes_the_result_and_never_again(
     now_s = 1e9
     for number, pause_s in enumerate(PAUSES_S, start=1):
         handover.try_all("orders", now_s)
-        waiting = ledger.waiting()
-        assert [(w.tries, w.next_s) for w in waiting] == [(number, now_s + pause_s)]
-        assert "503" in waiting[0].error
+        (waiting,) = ledger.waiting()
+        assert waiting.tries == number
+        assert now_s + pause_s <= waiting.next_s < now_s + pause_s + _TIMELY_S
+        assert "503" in waiting.error
         handover.try_all("orders", now_s + pause_s - 0.1)
         assert len(receiver.got) == number
-        now_s += pause_s
+        now_s = waiting.next_s
     # The station was restarted meanwhile; a redirect is no delivery either.
     handover, ledger = _hand_over(tmp_path, console, scans, sections)
     receiver.answer = 307
@@ -308,7 +311,7 @@ def test_a_webhook_is_tried_until_it_takes_the_result_and_never_again(
     handover.try_all("orders", now_s)
     assert len(ledger.waiting()) == 1
     receiver.answer = 204
-    now_s += PAUSES_S[-1]
+    now_s = ledger.waiting()[0].next_s
     handover.try_all("orders", now_s)
     assert ledger.waiting() == []
     handover.look()
