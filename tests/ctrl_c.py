@@ -1,4 +1,4 @@
-"""Ctrl-C for a process that a test starts."""
+"""Ctrl-C, and a closed terminal, for a process that a test starts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import signal
 
 
 def heard() -> None:
-    """Undo what a shell does that runs the tests in the background: it ignores Ctrl-C on behalf of
-    all. For `preexec_fn`."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Undo what a shell does that runs the tests in the background, and nohup: they ignore Ctrl-C
+    and a closed terminal on behalf of all. For `preexec_fn`."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)

@@ -185,7 +185,8 @@ def test_a_command_that_is_told_to_end_leaves_no_folder(
         "run(wait)\n"
     )
     command = [sys.executable, "-c", source]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as waiting:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, text=True, preexec_fn=heard) as waiting:
         assert waiting.stdout is not None
         assert waiting.stdout.readline() == "waits\n"
         waiting.send_signal(number)
@@ -208,7 +209,11 @@ def test_a_command_under_nohup_outlives_its_terminal() -> None:
     ignoring = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); exec({source!r})"
     said = [
         subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            preexec_fn=heard,
         ).stdout
         for code in (source, ignoring)
     ]
