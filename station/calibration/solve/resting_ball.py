@@ -118,8 +118,8 @@ def check_doubts(problem: Problem, state: State) -> None:
         )
     raise CalibrationError(
         "the places of the ball on the floor do not lie on one floor (one is "
-        f"{1e3 * abs(worst.off_m):.0f} mm off): take away what the ball lay on; start again with "
-        "station calibrate --new"
+        f"{1e3 * abs(worst.off_m):.0f} mm off): take away what the ball lay on, or lay it where "
+        "the floor is even; start again with station calibrate --new"
     )
 
 
