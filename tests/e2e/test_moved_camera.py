@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,8 @@ def test_a_scan_is_accepted_when_none_has(
     assert checked.returncode == 4, checked.stdout
     assert '"moved": false' in checked.stdout
     assert '"changed": true' in checked.stdout
+    depths = [view["depth_change"] for view in json.loads(checked.stdout)]
+    assert depths == pytest.approx(np.zeros(4), abs=1e-4)
 
 
 def test_a_calibration_without_its_empty_booth_cannot_be_checked(booth: Path) -> None:

@@ -13,6 +13,8 @@ import pytest
 from seen_balls import ball
 
 from station.calibration.detect.detections import BallDetection
+from station.calibration.detect.scene import static_view
+from station.calibration.detect.step_names import MARK
 from station.calibration.detect.swing import LOOK_S, whole_swings
 from station.calibration.guide import finder, steps
 from station.calibration.guide.feed import Feed, TimedFrame
@@ -397,6 +399,48 @@ def test_a_board_has_to_stand_still_and_nobody_beside_it(tmp_path: Path) -> None
         with pytest.raises(CalibrationError, match="no camera sees a flat board that stands still"):
             look(nothing, 1)
     assert session.wall_count == 1
+
+
+def test_depths_that_changed_are_noted_with_a_board(tmp_path: Path) -> None:
+    name = _CAMERAS[1]
+    session = Session.begin(tmp_path, "2026", 0.1, {name: default_rig().cameras[name]})
+    guide = Guide(attended=False, countdown_s=0.0)
+    empty, board = (
+        _pictures(SimulatedBooth(clutter=clutter), None, 30)
+        for clutter in ([], [box((-0.9, 0.3, 0.5), (0.3, 0.32, 1.7))])
+    )
+    look_at_empty_booth(cast(Feed, _Pictures(empty)), session, guide)
+    look_at_wall(cast(Feed, _Pictures(_warmer(board))), session, guide, 0)
+    assert session.depth_changes == {"wall-0": {name: pytest.approx(8e-4, abs=1e-4)}}
+    look_at_empty_booth(cast(Feed, _Pictures(_warmer(empty))), session, guide)
+    assert session.depth_changes == {"wall-0": {name: pytest.approx(0.0, abs=1e-4)}}
+
+
+def test_depths_that_changed_are_noted_with_a_ball(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty = _pictures(SimulatedBooth(), None, 12)
+    warm = _warmer(empty)
+
+    class Warm(_Looks):
+        def newest(self) -> list[TimedFrame]:
+            return [
+                TimedFrame(frame.camera, frame.time_s, warm[self._next % 12], DEPTH_SCALE_M)
+                for frame in super().newest()
+            ]
+
+    rig = default_rig().cameras
+    session = Session.begin(tmp_path, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    session.record_empty({name: static_view(empty, DEPTH_SCALE_M) for name in _CAMERAS}, [])
+    monkeypatch.setattr(finder, "find_ball", lambda *given, **_: ball(given[1].name, given[3]))
+    balls = rest_ball(cast(Feed, Warm(2.0)), session, Guide(attended=False, countdown_s=0.0), MARK)
+    session.record_resting(MARK, balls)
+    changes = Session.load(tmp_path).depth_changes
+    assert changes == {MARK: dict.fromkeys(_CAMERAS, pytest.approx(8e-4, abs=1e-4))}
+
+
+def _warmer(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    return [np.rint((1.0 + 8e-4) * picture).astype(np.uint16) for picture in pictures]
 
 
 @pytest.mark.parametrize("noise", [1.0, 2.0])

@@ -429,4 +429,5 @@ def test_depths_that_changed_are_told(
     check_cli._tell(moves, [], depths, moved=False)
     out = capsys.readouterr().out
     assert ("all cameras see the booth" in out) == bool(words)
+    assert ("the booth is in order" in out) != bool(words)
     assert words in out

@@ -12,10 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from seen_balls import CAMERAS, ball
 
+from station.calibration.detect.detections import Observations
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.detect.step_names import EMPTY, MARK
-from station.calibration.detect.warmth import depth_change
+from station.calibration.detect.warmth import common_change, depth_change
 from station.calibration.guide.session import JOURNAL, Session
+from station.calibration.solve.solving import solve
 from station.calibration.solve.warming import check_warm, warming_words, widen_by_warming
 from station.core.errors import CalibrationError, FormatError
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
@@ -65,15 +67,76 @@ def test_another_booth_says_nothing_of_the_depths(empty: StaticView) -> None:
     assert depth_change([], DEPTH_SCALE_M, empty) is None
 
 
-def test_what_the_steps_saw_is_kept_with_them(tmp_path: Path) -> None:
-    session = Session.begin(tmp_path, "2026-11-21T10:00:00Z", 0.1, CAMERAS)
-    session.note_depths(MARK, "front-lower", 3e-4)
-    session.record_resting(MARK, [ball("front-lower", 5.0)])
+def test_curtains_that_hang_otherwise_say_nothing_of_the_depths(empty: StaticView) -> None:
+    rows = np.arange(480)[:, None]
+    hung = empty.depth_m() * (1.0 + 5e-3 * np.sign(np.sin(rows / 40.0 * np.pi)))
+    frames = [np.asarray(hung / DEPTH_SCALE_M, np.uint16)] * 3
+    assert depth_change(frames, DEPTH_SCALE_M, empty) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "common"),
+    [
+        ({}, 0.0),
+        ({"a": 0.0, "b": 2e-3}, 0.0),
+        ({"a": 0.0, "b": 0.0, "c": 1e-3, "d": 1e-3}, 0.0),
+        ({"a": -1e-3, "b": 1e-3}, 0.0),
+        ({"a": 1e-3, "b": 9e-4}, 9e-4),
+        ({"a": -1e-3, "b": -9e-4, "c": 4e-3}, -9e-4),
+    ],
+)
+def test_one_camera_does_not_speak_for_all(changes: dict[str, float], common: float) -> None:
+    """It may have been moved: by 2 mm, a wall is 0.1 % farther away."""
+    assert common_change(changes) == common
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    return Session.begin(tmp_path, "2026-11-21T10:00:00Z", 0.1, CAMERAS)
+
+
+def _rest(session: Session, step: str, **changes: float) -> None:
+    session.note_depths(step, {name.replace("_", "-"): own for name, own in changes.items()})
+    session.record_resting(step, [ball("front-lower", 5.0)])
+
+
+def _kept(session: Session) -> dict[str, dict[str, float]]:
+    seen = Session.load(session.folder).depth_changes
+    assert seen == session.depth_changes
+    return seen
+
+
+def test_what_the_steps_saw_is_kept_with_them(session: Session) -> None:
+    _rest(session, MARK, front_lower=3e-4)
+    session.note_depths("wall-0", {"front-upper": 2e-4})
     session.record_wall("wall-0", [])
-    kept = {MARK: {"front-lower": 3e-4}}
-    assert Session.load(tmp_path).observations().depth_changes == kept
+    assert _kept(session) == {MARK: {"front-lower": 3e-4}, "wall-0": {"front-upper": 2e-4}}
+    assert session.observations().depth_changes == session.depth_changes
+
+
+def test_a_step_that_is_repeated_counts_anew(session: Session) -> None:
+    """Its change when the sensors were cold refused the calibration for ever."""
+    _rest(session, MARK, front_lower=9e-4, back_lower=9e-4)
+    _rest(session, "stand-1700", front_upper=9e-4)
+    _rest(session, "stand-900", front_upper=9e-4)
+    _rest(session, MARK, front_lower=1e-5)
+    _rest(session, "stand-1710", front_upper=2e-5)
+    session.forget_raised(["stand-900"])
+    kept = _kept(session)
+    assert list(kept.items()) == [
+        (MARK, {"front-lower": 1e-5}),
+        ("stand-1710", {"front-upper": 2e-5}),
+    ]
+    _rest(session, MARK)
+    assert MARK not in _kept(session)
+
+
+def test_the_empty_booth_recorded_anew_forgets_no_change(session: Session) -> None:
+    """A calibration that had been refused was accepted after it, 8 mm wrong."""
+    _rest(session, MARK, front_lower=9e-4, back_lower=9e-4)
+    session.note_depths(EMPTY, {"front-lower": 1e-4})
     session.record_empty({}, [])
-    assert Session.load(tmp_path).observations().depth_changes == {}
+    assert _kept(session) == {MARK: {"front-lower": pytest.approx(8e-4)}}
 
 
 @pytest.mark.parametrize("changes", [3e-4, {"front-lower": "much"}, {"elsewhere": 1e-4}])
@@ -98,7 +161,8 @@ def _changes(*common: float) -> dict[str, dict[str, float]]:
     [
         ((2e-4, 9e-4), r"0\.09 % farther away"),
         ((-2e-4, -6e-4), r"0\.06 % nearer"),
-        ((-3e-4, 3e-4), r"0\.06 % "),
+        ((-3e-4, 3e-4), r"0\.06 % farther away"),
+        ((3e-4, -3e-4), r"0\.06 % nearer"),
     ],
 )
 def test_a_calibration_of_sensors_that_warm_up_is_refused(
@@ -114,7 +178,7 @@ def test_warm_sensors_change_nothing(common: tuple[float, ...]) -> None:
     changes = _changes(*common)
     check_warm(changes)
     assert warming_words(changes) == ""
-    assert widen_by_warming(SAID, changes) == SAID
+    assert widen_by_warming(SAID, changes, 8e-3) == SAID
 
 
 def test_a_slight_change_widens_what_is_stated() -> None:
@@ -122,5 +186,18 @@ def test_a_slight_change_widens_what_is_stated() -> None:
     changes = _changes(1e-4, 3e-4)
     check_warm(changes)
     assert "0.03 % farther away" in warming_words(changes)
-    widened = widen_by_warming(SAID, changes)
+    widened = widen_by_warming(SAID, changes, 8e-3)
     assert 1.96 * np.sqrt(widened.girth_sigma_m**2 - SAID.girth_sigma_m**2) > 2.1e-3
+    with pytest.raises(CalibrationError, match="warm up for 20 minutes"):
+        widen_by_warming(SAID, changes, 3e-3)
+
+
+def test_a_solution_is_not_begun_with_sensors_that_warmed_up() -> None:
+    """It named a camera that had moved, and none had."""
+    seen = [ball(name, 0.1 * k) for name in CAMERAS for k in range(100)]
+    observations = Observations(seen, seen[:1], depth_changes={MARK: dict.fromkeys(CAMERAS, 9e-4)})
+    with pytest.raises(CalibrationError, match=r"0\.09 % farther away in one step"):
+        solve(
+            observations, CAMERAS, radius_m=0.1, reference="front-upper",
+            front_cameras=["front-upper"], created="2026-11-21T10:00:00Z",
+        )  # fmt: skip

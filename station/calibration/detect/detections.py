@@ -197,14 +197,6 @@ class Observations:
                 place: [one for part in listed for one in part.around.get(place, ())]
                 for place in places
             },
-            depth_changes={
-                step: {
-                    camera: change
-                    for part in listed
-                    for camera, change in part.depth_changes.get(step, {}).items()
-                }
-                for step in dict.fromkeys(step for part in listed for step in part.depth_changes)
-            },
         )
 
 

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, raw_inverse_depth
 
+TELLING = 5e-4
+"""Change of all cameras' depths by which girths are wrong that are stated to a few millimetres."""
+GIRTH_M_PER_CHANGE = 7.0
+"""Metres by which a girth of a metre is too small where depths are larger by a share of 1."""
 _SAME_PER_M = 0.01
 """Readings that differ by more, 1/m, are of somebody or something that was not there."""
 _ALWAYS = 0.9
@@ -22,13 +26,15 @@ _BLOCK_PX = 40
 _LEAST_SHARE = 0.5
 """Share of a block's pixels that have to show what the empty booth shows."""
 _FEWEST_BLOCKS = 12
+_LARGEST_ERROR = 1e-4
+"""Standard error beyond which what is seen does not stand still, such as curtains."""
 
 
 def depth_change(
     frames: Iterable[NDArray[np.uint16]], scale_m: float, empty: StaticView
 ) -> float | None:
     """Relative change of the depths since the empty booth was recorded: 1e-3 if all surfaces seem
-    to be 0.1 % farther away; None where too little of it is seen.
+    to be 0.1 % farther away; None where too little of it is seen, or does not stand still.
 
     The median over blocks of the image, in each the mean over pixels: their median would stay at a
     step of the disparity.
@@ -43,21 +49,29 @@ def depth_change(
         total += inverse
         read += inverse > 0
         count += 1
-    both = (read > _ALWAYS * max(count, 1)) & (empty.share > _ALWAYS)
     before = empty.inverse_depth / np.maximum(empty.share, _ALWAYS)
-    less = before - total / np.maximum(read, 1.0)
-    same = both & (np.abs(less) < _SAME_PER_M)
-    pixels, changed, level = (_in_blocks(image) for image in (same, same * less, same * before))
+    fallen = before - total / np.maximum(read, 1.0)
+    both = (read > _ALWAYS * max(count, 1)) & (empty.share > _ALWAYS) & (before > 0)
+    same = both & (np.abs(fallen) < _SAME_PER_M)
+    pixels, changed, level = (_in_blocks(image) for image in (same, same * fallen, same * before))
     known = pixels > _LEAST_SHARE * _BLOCK_PX**2
     if known.sum() < _FEWEST_BLOCKS:
         return None
-    return float(np.median(changed[known] / level[known]))
+    shares = changed[known] / level[known]
+    low, middle, high = np.quantile(shares, (0.25, 0.5, 0.75))
+    # Standard error of a median; the quartiles of a normal distribution are 1.349 sigma apart.
+    error = 1.2533 * (high - low) / 1.349 / np.sqrt(len(shares))
+    return float(middle) if error <= _LARGEST_ERROR else None
 
 
 def common_change(changes: Mapping[str, float]) -> float:
-    """The change that cameras (name -> change) have in common, whatever one of them shows; 0 where
-    none shows any."""
-    return float(np.median([*changes.values()])) if changes else 0.0
+    """The change that more than half of the cameras (name -> change) show at least; 0 where they do
+    not agree."""
+    ordered = sorted(changes.values())
+    if not ordered:
+        return 0.0
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return 0.0 if low < 0.0 < high else min(low, high, key=abs)
 
 
 def _in_blocks(image: NDArray[np.generic]) -> NDArray[np.float64]:

@@ -10,7 +10,12 @@ from pathlib import Path
 import click
 import numpy as np
 
-from station.calibration.detect.warmth import common_change, depth_change
+from station.calibration.detect.warmth import (
+    GIRTH_M_PER_CHANGE,
+    TELLING,
+    common_change,
+    depth_change,
+)
 from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.last_check import keep_check
@@ -31,8 +36,6 @@ _FRAMES = 30
 _SENSORS_S = 20.0
 _EXIT_MOVED = 3
 _EXIT_CHANGED = 4
-_CHANGED_DEPTHS, _CHANGE_PER_MM = 5e-4, 1.4e-4
-"""Change of all depths that is told, and the one by which girths come out a millimetre off."""
 
 
 @click.command()
@@ -145,7 +148,8 @@ def _tell(
         click.echo(move.words())
     for line in _unseen_lines(moves):
         click.echo(f"  {line}")
-    if words := depths_words(moves) or _depths_line(depths):
+    words = depths_words(moves) or _depths_line(depths)
+    if words:
         click.echo(words)
     if changed:
         most = min(changed, key=lambda move: move.share)
@@ -156,18 +160,19 @@ def _tell(
             "not there and put back what is missing, so that small moves can be detected"
         )
     elif not moved:
-        click.echo("the booth is in order: no camera has moved, as far as their views can show")
+        order = "" if words else "the booth is in order: "
+        click.echo(f"{order}no camera has moved, as far as their views can show")
 
 
 def _depths_line(depths: Mapping[str, float]) -> str:
     """Line on depths that all cameras see changed; "" where they are as at the calibration."""
     change = common_change(depths)
-    if abs(change) <= _CHANGED_DEPTHS:
+    if abs(change) <= TELLING:
         return ""
     return (
         f"all cameras see the booth {100.0 * abs(change):.2f} % "
         f"{'farther away' if change > 0.0 else 'nearer'} than when they were calibrated: girths "
-        f"come out about {abs(change) / _CHANGE_PER_MM:.0f} mm too "
+        f"come out about {1e3 * GIRTH_M_PER_CHANGE * abs(change):.0f} mm too "
         f"{'small' if change > 0.0 else 'large'}; let the sensors warm up for 20 minutes, and "
         "check again; if nothing changes, run station calibrate"
     )
@@ -209,7 +214,7 @@ def _look(feed: Feed, rig: Rig, names: list[str], quiet: bool) -> dict[str, list
     return taken
 
 
-def _document(move: CameraMove, depth_change: float | None) -> dict[str, object]:
+def _document(move: CameraMove, change: float | None) -> dict[str, object]:
     return {
         "camera": move.camera,
         "moved": move.moved,
@@ -219,6 +224,6 @@ def _document(move: CameraMove, depth_change: float | None) -> dict[str, object]
         "translation_m": move.xi[3:].tolist(),
         "sigma": np.sqrt(np.diag(move.stated)).tolist(),
         "background_share": move.share,
-        "depth_change": depth_change,
+        "depth_change": change,
         "unseen": move.unseen_words(),
     }

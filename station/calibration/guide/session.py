@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -70,6 +70,8 @@ class Session(Seen):
     """The ball is being waved anew, or this was stopped: nothing is replaced yet."""
     _later_s: float | None = 0.0
     """Shift of this run's times; None until its first detection."""
+    _noted: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Notes by `note_depths` on a step that is not recorded yet."""
 
     @classmethod
     def begin(
@@ -143,12 +145,13 @@ class Session(Seen):
         """The empty booth and its floor."""
         for camera, view in views.items():
             view.save(private_folder(self.folder / SCENE) / f"{camera}.npz")
-        self._append({"step": EMPTY, "planes": [plane.to_json() for plane in planes]})
+        seen = {"step": EMPTY, "planes": [plane.to_json() for plane in planes]}
+        self._append({**seen, **self._noted_depths(EMPTY)})
 
-    def note_depths(self, step: str, camera: str, change: float) -> None:
-        """Note how a camera's depths have changed (relative) since the empty booth was recorded;
-        on disk with the step."""
-        self.depth_changes.setdefault(step, {})[camera] = change
+    def note_depths(self, step: str, changes: Mapping[str, float]) -> None:
+        """Note relative changes of the cameras' depths since the empty booth was recorded, to be
+        recorded with the step."""
+        self._noted = {step: dict(changes)}
 
     def record_wall(self, place: str, planes: Sequence[PlaneObservation]) -> None:
         """A flat board at one place ("wall-0", "wall-1", ...)."""
@@ -162,7 +165,7 @@ class Session(Seen):
 
     def _noted_depths(self, step: str) -> dict[str, Any]:
         """The step's part of its line on the depths; nothing where they were not seen."""
-        changes = self.depth_changes.get(step)
+        changes = self._noted.pop(step, {})
         return {_DEPTHS: changes} if changes else {}
 
     def begin_run(self, *, again: bool = False) -> None:
@@ -248,6 +251,7 @@ class Session(Seen):
                 raise ValueError("places are a list")
             for place in entry["places"]:
                 self.around.pop(str(place), None)
+                self.depth_changes.pop(str(place), None)
         elif step == BALL:
             self._take_run(self._balls(entry))
         elif step == _BALL_AGAIN:
@@ -263,6 +267,7 @@ class Session(Seen):
         elif kind_of(step) in PLACES:
             for other in self.replaced_by(step):
                 del self.around[other]
+                self.depth_changes.pop(other, None)
             self.around[step] = self._balls(entry)
         elif step == "board":
             for name, lens in entry["lenses"].items():
@@ -275,12 +280,27 @@ class Session(Seen):
         else:
             planes = [PlaneObservation.from_json(plane) for plane in entry["planes"]]
             self.planes[step] = self._known(planes)
+        if "balls" in entry or "planes" in entry:
+            self._take_depths(step, entry.get(_DEPTHS, {}))
+
+    def _take_depths(self, step: str, noted: Mapping[str, Any]) -> None:
+        """Take the changes of the depths seen in a step, in place of what it had seen before."""
+        changes = {str(name): float(finite_numbers(change, ())) for name, change in noted.items()}
+        for name in changes:
+            self._check_camera(name)
         if step == EMPTY:
-            # What follows is compared with this one.
-            self.depth_changes.clear()
-        for name, change in entry.get(_DEPTHS, {}).items():
-            self._check_camera(str(name))
-            self.note_depths(step, str(name), float(finite_numbers(change, ())))
+            # Earlier steps were compared with the empty booth before.
+            self.depth_changes = {
+                earlier: {
+                    name: own - changes[name] for name, own in seen.items() if name in changes
+                }
+                for earlier, seen in self.depth_changes.items()
+            }
+            return
+        # A step that is repeated counts as the latest.
+        self.depth_changes.pop(step, None)
+        if changes:
+            self.depth_changes[step] = changes
 
     def _take_run(self, seen: Sequence[BallDetection]) -> None:
         later_s = self._moved_by(min(ball.time_s for ball in seen))

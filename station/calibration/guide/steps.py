@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
 from station.calibration.detect.scene import static_view
-from station.calibration.detect.step_names import HANGING, WALL, numbered_step
+from station.calibration.detect.step_names import EMPTY, HANGING, WALL, numbered_step
 from station.calibration.detect.stillness import check_board_stands, check_stillness
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
 from station.calibration.detect.warmth import depth_change
@@ -69,6 +69,7 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
         if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
     ]
     views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
+    session.note_depths(EMPTY, _depth_changes(session, taken))
     session.record_empty(views, floors)
     seen = ", ".join(floor.camera for floor in floors)
     guide.done(
@@ -103,8 +104,7 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
             "no camera sees a flat board that stands still: put it upright, facing the cameras, "
             "1 m or more wide, and stand beside it, not before it"
         )
-    for camera, (stack, scale_m) in taken.items():
-        _note_depths(session, name, camera, stack, scale_m)
+    session.note_depths(name, _depth_changes(session, taken))
     session.record_wall(name, walls)
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
@@ -158,10 +158,12 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
             "(calibrate.ball_radius_m)"
             + ("; a recording of it has to last 3 s or longer" if feed.replays else "")
         )
-    for camera, frames in last.items():
-        if frames:
-            pixels = (frame.pixels() for frame in frames)
-            _note_depths(session, step, camera, pixels, frames[0].scale_m)
+    looked = {
+        name: ([frame.pixels() for frame in frames], frames[0].scale_m)
+        for name, frames in last.items()
+        if frames
+    }
+    session.note_depths(step, _depth_changes(session, looked))
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
 
@@ -317,14 +319,21 @@ def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
 
 
-def _note_depths(
-    session: Session, step: str, camera: str, frames: Iterable[NDArray[np.uint16]], scale_m: float
-) -> None:
-    """Note how a camera's depths have changed since the empty booth was recorded, if they show."""
-    empty = session.background(camera)
-    change = None if empty is None else depth_change(frames, scale_m, empty)
-    if change is not None:
-        session.note_depths(step, camera, change)
+def _depth_changes(
+    session: Session, looked: Mapping[str, tuple[Iterable[NDArray[np.uint16]], float]]
+) -> dict[str, float]:
+    """Relative changes of the cameras' depths since the empty booth was recorded, where they show.
+
+    Args:
+        looked: each camera's frames (h, w), and their scale.
+    """
+    changes = {}
+    for name, (frames, scale_m) in looked.items():
+        empty = session.background(name)
+        change = None if empty is None else depth_change(frames, scale_m, empty)
+        if change is not None:
+            changes[name] = change
+    return changes
 
 
 def _background(session: Session, camera: str) -> Image | None:

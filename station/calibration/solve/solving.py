@@ -94,12 +94,13 @@ def solve(
         rig = _rig(problem, world_poses, state, created, acceptance.overall_rms(found))
         predicted = predict_errors(problem, state, world_poses, rig.cameras)
         predicted = acceptance.widen_by_test(predicted, found)
-        predicted = warming.widen_by_warming(predicted, observations.depth_changes)
         heights_m = problem.heights_m.values()
         refusals.check_predicted(predicted, limits, coverage, heights_m, boarded(problem))
+        changes = observations.depth_changes
+        predicted = warming.widen_by_warming(predicted, changes, limits.girth_m)
         rig = replace(rig, predicted=predicted)
         weak = advice(problem, state, predicted, world_poses, limits, coverage)
-        if words := warming.warming_words(observations.depth_changes):
+        if words := warming.warming_words(changes):
             weak = (words, *weak)
         return Solution(rig, world_poses, found, weak, state.clock_s, measured_m)
 

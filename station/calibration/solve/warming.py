@@ -1,24 +1,27 @@
 """Change of the sensors' depths while a booth is being calibrated, as while they warm up.
 
-A depth that is larger by a share makes cameras that face each other see a thinner body. No
-comparison of cameras tells it from poses, so that only what the steps saw of the empty booth
-shows it (`station.calibration.detect.warmth`).
+Where depths grow by a share, cameras that face each other see a thinner body. No comparison of
+cameras tells that from other poses, so that only what the steps saw of the empty booth shows it
+(`station.calibration.detect.warmth`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from station.calibration.detect.warmth import common_change
+import numpy as np
+
+from station.calibration.detect.warmth import TELLING, common_change
+from station.calibration.solve.refusals import SIGMAS_95
 from station.core.errors import CalibrationError
 from station.core.rig import PredictedError
 
 Changes = Mapping[str, Mapping[str, float]]
-"""Step -> camera -> relative change of its depths since the empty booth was recorded."""
+"""Step -> camera -> relative change of its depths since the empty booth was recorded; the steps in
+the order in which they were done."""
 
-_LARGEST, _REMARKED, _NOISE = 5e-4, 2e-4, 1e-4
-"""Changes that are refused, and remarked upon, and up to which the comparison errs. Girths change
-by 7 mm where depths change by 1e-3."""
+_REMARKED, _NOISE = 2e-4, 1e-4
+"""Changes that are remarked upon, and up to which the comparison errs."""
 _BODY_M = 1.7
 """Distance of a body from the cameras."""
 
@@ -29,12 +32,25 @@ def check_warm(changes: Changes) -> None:
     Raises:
         CalibrationError: by how much, and what to do.
     """
-    if abs(change := _largest(changes)) > _LARGEST:
-        raise CalibrationError(
-            f"all cameras see the empty booth {_percent(change)} % {_where(change)} than when it "
-            "was recorded, as sensors do that are colder or warmer: let them warm up for 20 "
-            "minutes; start again with station calibrate --new"
-        )
+    if abs(change := _largest(changes)) > TELLING:
+        raise _too_much(change)
+
+
+def widen_by_warming(
+    predicted: PredictedError, changes: Changes, girth_limit_m: float
+) -> PredictedError:
+    """Predicted errors widened by what the depths changed by: nobody knows which step's the depths
+    of later scans are like.
+
+    Raises:
+        CalibrationError: girths may now err by more than the limit (95 %).
+    """
+    if abs(change := _largest(changes)) <= _NOISE:
+        return predicted
+    widened = predicted.widened(abs(change) * _BODY_M)
+    if SIGMAS_95 * widened.girth_sigma_m > girth_limit_m:
+        raise _too_much(change)
+    return widened
 
 
 def warming_words(changes: Changes) -> str:
@@ -43,23 +59,25 @@ def warming_words(changes: Changes) -> str:
         return ""
     return (
         "for girths, let the sensors warm up for 20 minutes before the first step: all cameras "
-        f"saw the empty booth {_percent(change)} % {_where(change)} than when it was recorded"
+        f"saw the booth {_percent(change)} % {_where(change)} in one step than in an earlier one"
     )
 
 
-def widen_by_warming(predicted: PredictedError, changes: Changes) -> PredictedError:
-    """Predicted errors widened by what the depths changed by: of the next scans' depths, nobody
-    knows which of the steps they are like."""
-    change = abs(_largest(changes))
-    return predicted.widened(change * _BODY_M) if change > _NOISE else predicted
-
-
 def _largest(changes: Changes) -> float:
-    """The change between any two steps, the empty booth among them, that all cameras show: the
-    later less the earlier, where the empty booth is the earliest."""
-    common = [0.0, *map(common_change, changes.values())]
-    low, high = min(common), max(common)
-    return high - low if high >= -low else low - high
+    """The largest change from one step to a later one that most of the cameras show; the empty
+    booth is the first step."""
+    cameras = {name for seen in changes.values() for name in seen}
+    common = [0.0, *(common_change(s) for s in changes.values() if 2 * len(s) > len(cameras))]
+    low, high = int(np.argmin(common)), int(np.argmax(common))
+    return common[max(low, high)] - common[min(low, high)]
+
+
+def _too_much(change: float) -> CalibrationError:
+    return CalibrationError(
+        f"all cameras saw the booth {_percent(change)} % {_where(change)} in one step than in an "
+        "earlier one, as sensors do that are colder or warmer: let them warm up for 20 minutes; "
+        "start again with station calibrate --new"
+    )
 
 
 def _percent(change: float) -> str:
