@@ -130,10 +130,10 @@ class HandOver:
         """Hand over the results that are due to one target."""
         mine = [entry for entry in self._ledger.waiting() if entry.target == name]
         due = [entry for entry in mine if entry.due(now_s)]
-        received, began_s = False, time.monotonic()
+        received, ahead_s = False, now_s - time.monotonic()
         for entry in due:
             self._round_s[name] = time.monotonic()
-            received |= self._try(entry, now_s + time.monotonic() - began_s)
+            received |= self._try(entry, ahead_s)
             self._settle(entry)
         if received:
             # The others need not wait as long as after their own failures.
@@ -153,22 +153,24 @@ class HandOver:
             self._log.warning(words, entry.scan_id, entry.target, extra={"scan": entry.scan_id})
         self._ledger.forget(entry.scan_id)
 
-    def _try(self, entry: Waiting, now_s: float) -> bool:
-        """Hand one result over; whether the target has received it."""
+    def _try(self, entry: Waiting, ahead_s: float) -> bool:
+        """Hand one result over; whether the target has received it.
+
+        Args:
+            ahead_s: what the times of tries are ahead of the monotonic clock.
+        """
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
             return False
-        began_s = time.monotonic()
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
-            self._postpone(entry, str(error), now_s + time.monotonic() - began_s)
+            self._postpone(entry, str(error), ahead_s)
             return False
         except Exception as error:
             # One result that is damaged must not keep the others from being handed over.
             self._log.exception("handing over %s", entry.scan_id, extra={"scan": entry.scan_id})
-            words = f"{type(error).__name__}: {error}"
-            self._postpone(entry, words, now_s + time.monotonic() - began_s)
+            self._postpone(entry, f"{type(error).__name__}: {error}", ahead_s)
             return False
         self._ledger.finish(entry)
         self._log.info(
@@ -176,8 +178,9 @@ class HandOver:
         )
         return True
 
-    def _postpone(self, entry: Waiting, reason: str, ended_s: float) -> None:
+    def _postpone(self, entry: Waiting, reason: str, ahead_s: float) -> None:
         # From the end of the try: a slow receiver would get the next one without a pause.
+        ended_s = time.monotonic() + ahead_s
         after = entry.failed(reason, ended_s)
         self._ledger.keep(after)
         self._log.warning(
