@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -143,6 +143,14 @@ def _finite_image(values: NDArray[np.generic]) -> Image:
 def raw_inverse_depth(depth: NDArray[np.uint16], scale_m: float) -> Image:
     """1/z in 1/m of a depth frame in units of scale_m; 0 stays 0."""
     return inverse_depth(depth.astype(np.float32) * np.float32(scale_m))
+
+
+def mean_view(frames: Sequence[NDArray[np.uint16]], scale_m: float) -> tuple[Image, Image]:
+    """Mean inverse depth (h, w) of some frames, no reading counting as 0, and the share (h, w) of
+    them that have a reading."""
+    inverse = [raw_inverse_depth(frame, scale_m) for frame in frames]
+    share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
+    return np.asarray(np.mean(inverse, axis=0), np.float32), np.asarray(share)
 
 
 def smoothed(inverse: Image, share: Image) -> tuple[Image, Image]:

@@ -7,12 +7,12 @@ noise, so that their readings show a change of a few hundredths of a per cent.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.scene import StaticView, raw_inverse_depth
+from station.calibration.detect.scene import StaticView, mean_view
 
 TELLING = 5e-4
 """Change of all cameras' depths by which girths are wrong that are stated to a few millimetres."""
@@ -31,7 +31,7 @@ _LARGEST_ERROR = 1e-4
 
 
 def depth_change(
-    frames: Iterable[NDArray[np.uint16]], scale_m: float, empty: StaticView
+    frames: Sequence[NDArray[np.uint16]], scale_m: float, empty: StaticView
 ) -> float | None:
     """Relative change of the depths since the empty booth was recorded: 1e-3 if all surfaces seem
     to be 0.1 % farther away; None where too little of it is seen, or does not stand still.
@@ -42,16 +42,12 @@ def depth_change(
     Args:
         frames: (h, w) each, of a camera that has not moved; people may stand in its view.
     """
-    total, read = np.zeros(empty.share.shape, np.float32), np.zeros(empty.share.shape, np.float32)
-    count = 0
-    for frame in frames:
-        inverse = raw_inverse_depth(frame, scale_m)
-        total += inverse
-        read += inverse > 0
-        count += 1
+    if not len(frames):
+        return None
+    mean, share = mean_view(frames, scale_m)
     before = empty.inverse_depth / np.maximum(empty.share, _ALWAYS)
-    fallen = before - total / np.maximum(read, 1.0)
-    both = (read > _ALWAYS * max(count, 1)) & (empty.share > _ALWAYS) & (before > 0)
+    fallen = before - mean / np.maximum(share, _ALWAYS)
+    both = (share > _ALWAYS) & (empty.share > _ALWAYS) & (before > 0)
     same = both & (np.abs(fallen) < _SAME_PER_M)
     pixels, changed, level = (_in_blocks(image) for image in (same, same * fallen, same * before))
     known = pixels > _LEAST_SHARE * _BLOCK_PX**2

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.scene import raw_inverse_depth, smoothed
+from station.calibration.detect.scene import mean_view, smoothed
 from station.calibration.drift.alignment import Alignment, align
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import BLOCK, DriftReference
@@ -38,10 +38,7 @@ def estimate_move(
     reference: DriftReference, frames: Sequence[NDArray[np.uint16]], scale_m: float
 ) -> CameraMove:
     """Compare frames (h, w) in units of scale_m, of one moment, with the stored background."""
-    inverse = [raw_inverse_depth(frame, scale_m) for frame in frames]
-    share = np.mean(np.stack(inverse) > 0, axis=0, dtype=np.float32)
-    mean = np.asarray(np.mean(inverse, axis=0), np.float32)
-    return estimated(reference, mean, np.asarray(share), len(frames))
+    return estimated(reference, *mean_view(frames, scale_m), len(frames))
 
 
 def estimated(reference: DriftReference, mean: Image, share: Image, frames: int) -> CameraMove:

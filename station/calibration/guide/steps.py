@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.detect.scene import static_view
+from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.detect.step_names import EMPTY, HANGING, WALL, numbered_step
 from station.calibration.detect.stillness import check_board_stands, check_stillness
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
@@ -23,7 +23,6 @@ from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.seen import Seen
 from station.calibration.guide.session import Session
-from station.core.depth.images import Image
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
@@ -69,7 +68,7 @@ def look_at_empty_booth(feed: Feed, session: Session, guide: Guide) -> None:
         if (floor := observe_floor(stack, scale_m, cameras[name])) is not None
     ]
     views = {name: static_view(stack, scale_m) for name, (stack, scale_m) in taken.items()}
-    session.note_depths(EMPTY, _depth_changes(session, taken))
+    session.note_depths(EMPTY, _depth_changes(_empty_booth(session), taken))
     session.record_empty(views, floors)
     seen = ", ".join(floor.camera for floor in floors)
     guide.done(
@@ -90,12 +89,12 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
     """
     taken = _frames(feed, session, guide, _WALL_FRAMES)
     cameras, name = session.lensed_cameras(), numbered_step(WALL, place)
+    empty = _empty_booth(session)
     walls: list[PlaneObservation] = []
     for camera, (stack, scale_m) in taken.items():
-        background = _background(session, camera)
-        if background is None:
+        if camera not in empty:
             raise CalibrationError(EMPTY_FIRST)
-        wall = observe_wall(stack, scale_m, cameras[camera], name, background)
+        wall = observe_wall(stack, scale_m, cameras[camera], name, empty[camera].depth_m())
         if wall is not None:
             check_board_stands(wall, stack, scale_m)
             walls.append(wall)
@@ -104,7 +103,7 @@ def look_at_wall(feed: Feed, session: Session, guide: Guide, place: int) -> None
             "no camera sees a flat board that stands still: put it upright, facing the cameras, "
             "1 m or more wide, and stand beside it, not before it"
         )
-    session.note_depths(name, _depth_changes(session, taken))
+    session.note_depths(name, _depth_changes(empty, taken))
     session.record_wall(name, walls)
     guide.done(f"place {place + 1}: seen by {', '.join(wall.camera for wall in walls)}")
 
@@ -163,7 +162,7 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
         for name, frames in last.items()
         if frames
     }
-    session.note_depths(step, _depth_changes(session, looked))
+    session.note_depths(step, _depth_changes(_empty_booth(session), looked))
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
 
@@ -319,23 +318,24 @@ def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
 
 
+def _empty_booth(session: Session) -> dict[str, StaticView]:
+    """The empty booth as each camera saw it, where that was looked at."""
+    views = {name: session.background(name) for name in session.cameras}
+    return {name: view for name, view in views.items() if view is not None}
+
+
 def _depth_changes(
-    session: Session, looked: Mapping[str, tuple[Iterable[NDArray[np.uint16]], float]]
+    empty: Mapping[str, StaticView],
+    looked: Mapping[str, tuple[Iterable[NDArray[np.uint16]], float]],
 ) -> dict[str, float]:
     """Relative changes of the cameras' depths since the empty booth was recorded, where they show.
 
     Args:
         looked: each camera's frames (h, w), and their scale.
     """
-    changes = {}
-    for name, (frames, scale_m) in looked.items():
-        empty = session.background(name)
-        change = None if empty is None else depth_change(frames, scale_m, empty)
-        if change is not None:
-            changes[name] = change
-    return changes
-
-
-def _background(session: Session, camera: str) -> Image | None:
-    view = session.background(camera)
-    return None if view is None else view.depth_m()
+    changes = {
+        name: depth_change([*frames], scale_m, empty[name])
+        for name, (frames, scale_m) in looked.items()
+        if name in empty
+    }
+    return {name: change for name, change in changes.items() if change is not None}
