@@ -24,6 +24,7 @@ const main = document.getElementById('main');
 const rail = document.getElementById('rail');
 let session = null;
 let leave = () => {};
+let shown = null;
 let turn = 0;
 let failed = false;
 
@@ -75,6 +76,7 @@ function wanted() {
 async function show({ again = false } = {}) {
   const [view, rest] = wanted();
   const mine = ++turn;
+  shown = String([view, ...rest]);
   failed = false;
   leave();
   leave = () => {};
@@ -133,7 +135,8 @@ listen((kind) => {
     if (failed) show();
   }
 });
-window.addEventListener('hashchange', () => show());
+// Not the first view, whose address is given after it was shown: it may be in use.
+window.addEventListener('hashchange', () => { if (failed || String(wanted().flat()) !== shown) show(); });
 window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
 VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for

@@ -10,15 +10,19 @@ import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
+const STORED = ['accepted', 'reconstructing', 'delivered', 'rescan'];
 const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
 const TOGETHER_MS = 250;
 
-// What the view told when it was left: it is told on where it is drawn again in another language.
+// What the view told when it was left: it is told on where it is drawn again in another language,
+// and wherever the scan is not over.
 let kept = null;
+const underway = ({ asking, current }) => asking !== null || (current !== null && !FINAL.includes(current.state));
 
 export async function scan(main, session) {
-  if (!session.again) kept = null;
+  // Nobody knows how long a scan took whose end was awaited in another view.
+  if (kept && !session.again) kept = underway(kept) ? { ...kept, pressed: null } : null;
   const state = await get('/booth');
   const front = state.cameras.map((camera) => camera.name).filter((name) => name.startsWith('front'));
   const shown = front.length ? front : state.cameras.slice(0, 2).map((camera) => camera.name);
@@ -34,13 +38,14 @@ export async function scan(main, session) {
   let streaming = state.streaming;
   let able = state.can_scan;
   let compiling = state.compiling;
-  let asked = false;
+  let asking = null;
   let label = '';
   let current = null;
-  let pressed = 0;
+  let pressed = null;
   let took = null;
   let timer = null;
   let parts = null;
+  let closed = false;
 
   function ready() {
     current = null;
@@ -60,7 +65,7 @@ export async function scan(main, session) {
   // A press that the booth would refuse is not offered; the banner says what is in the way.
   function allow() {
     for (const button of stage.querySelectorAll('#go, #again')) {
-      button.disabled = asked || isLost() || !streaming || !able;
+      button.disabled = closed || asking !== null || isLost() || !streaming || !able;
     }
   }
 
@@ -78,18 +83,21 @@ export async function scan(main, session) {
     if (document.getElementById('go').disabled) return;
     pressed = performance.now();
     took = null;
-    asked = true;
+    const body = { label: label.trim(), countdown_s: session.countdown_s };
+    const answer = post('/scans', body, { 'Idempotency-Key': freshKey() });
+    answer.catch((error) => notice(error.message, true));
+    settle(answer);
+  }
+
+  // The view that asked for the scan may have been left before the booth answered.
+  async function settle(answer) {
+    asking = answer;
     allow();
-    try {
-      const body = { label: label.trim(), countdown_s: session.countdown_s };
-      const found = await post('/scans', body, { 'Idempotency-Key': freshKey() });
-      asked = false;
-      follow(found);
-    } catch (error) {
-      asked = false;
-      notice(error.message, true);
-      ready();
-    }
+    const found = await answer.catch(() => null);
+    if (closed) return;
+    asking = null;
+    if (found) follow(found);
+    else ready();
   }
 
   function follow(found) {
@@ -183,7 +191,7 @@ export async function scan(main, session) {
   function finish() {
     clearInterval(timer);
     const done = current;
-    took ??= ((performance.now() - pressed) / 1000).toFixed(1);
+    if (pressed !== null) took ??= ((performance.now() - pressed) / 1000).toFixed(1);
     const figure = bodyFigure();
     const cancelled = outcome(done) === 'cancelled';
     const look = { delivered: 'ok', rescan: 'rescan', failed: 'failed' }[done.state];
@@ -195,7 +203,7 @@ export async function scan(main, session) {
         h('div', {}, h('h2', {}, t(`scan.${cancelled ? 'cancelled' : look}`)), h('p', {}, done.label || t('result.noLabel')),
           done.reasons.length && !cancelled ? h('ul', {}, done.reasons.map((reason) => h('li', {}, said(reason)))) : null,
           done.unbegun ? h('p', {}, t('scan.unbegun')) : null,
-          done.state === 'failed' ? null : h('p', { className: 'small soft' }, t('scan.took', { n: took })))),
+          done.state === 'failed' || took === null ? null : h('p', { className: 'small soft' }, t('scan.took', { n: took })))),
       h('div', { className: 'actions' },
         done.state === 'failed' || done.gone ? null : h('a', { className: `button ${look === 'ok' ? 'primary' : ''}`, id: 'open', href: `#/result/${done.scan_id}` }, t('scan.open')),
         again,
@@ -225,7 +233,7 @@ export async function scan(main, session) {
   // Whether what is told of the last scan was deleted while nothing was heard.
   async function still() {
     const mine = current;
-    if (!mine || mine.state === 'failed' || !FINAL.includes(mine.state)) return;
+    if (!mine || !STORED.includes(mine.state)) return;
     try { await get(`/scans/${mine.scan_id}`); } catch (error) {
       if (error.status !== 404 || mine !== current) return;
       notice(t('scan.deleted'));
@@ -282,10 +290,17 @@ export async function scan(main, session) {
   const told = kept;
   if (told) ({ label, pressed, took } = told);
   ready();
-  if (told?.current) follow(told.current);
+  if (told?.asking) settle(told.asking);
+  else if (told?.current) {
+    follow(told.current);
+    ask();
+    still();
+  }
   latest();
   return () => {
-    kept = { label, pressed, took, current };
+    closed = true;
+    allow();
+    kept = { label, pressed, took, current, asking };
     clearInterval(timer);
     clearInterval(looking);
     clearTimeout(listing);
