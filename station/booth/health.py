@@ -88,7 +88,7 @@ def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
         str(problem)
         for content in processes.values()
         if reports(content)
-        for problem in content.get("problems", [])
+        for problem in [*content.get("problems", []), *content.get("remarks", [])]
     ]
     words = unusable(config) if reports(processes["sync"]) else ""
     # Sync says the same of sensors that it has seen.

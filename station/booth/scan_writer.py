@@ -16,7 +16,8 @@ from functools import partial
 from typing import TypeVar
 
 from station.booth.collection import LATE, Collection, Order
-from station.calibration.drift.motion import CameraMove, depths_words
+from station.calibration.drift.look import Look, compared
+from station.calibration.drift.motion import depths_words
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, write_bundle
@@ -68,6 +69,8 @@ class ScanWriter:
         self._stop = threading.Event()
         self._begun_s: float | None = None
         """Start of the task that is being done."""
+        self._remarks: list[tuple[str, str]] = []
+        """Date of the calibration that the words refer to, and the words."""
         self._thread = threading.Thread(target=self._run, name="scan writer", daemon=True)
         self._thread.start()
         self._tasks.put(self._settle_abandoned)
@@ -115,6 +118,10 @@ class ScanWriter:
                 self._begun_s = None
                 # A finished scan's frames must not stay in memory until the next one comes.
                 del task
+
+    def remarks(self, rig: Rig | None) -> list[str]:
+        """Words on the sensors, from the last scan's background, if they were calibrated so."""
+        return [words for created, words in self._remarks if rig and rig.created == created]
 
     def stalled(self, now_s: float) -> str:
         """The disk's delay in words, once it is long; empty otherwise."""
@@ -175,7 +182,7 @@ class ScanWriter:
             # Seconds where many cameras moved, in which no disk is waited for.
             self._begun_s = None
             try:
-                self._refuse_moved_cameras(collection)
+                rig = self._checked(collection)
             finally:
                 self._begun_s = time.monotonic()
         spool = self._spool
@@ -215,23 +222,28 @@ class ScanWriter:
             return  # a scan will say why
         self._tasks.put(partial(self._prepare_check, cameras[1:]))
 
-    def _refuse_moved_cameras(self, collection: Collection) -> None:
-        """A scan with a wrong calibration is useless: report it while the person is still there.
+    def _checked(self, collection: Collection) -> Rig:
+        """The calibration for the sensors as they are at this scan, whose depths may have changed.
+
+        A scan with a wrong one is useless: report it while the person is still there.
 
         Raises:
             CalibrationError: naming the cameras that moved.
         """
-        moved: list[CameraMove] = []
+        rig, looks = collection.rig, dict[str, Look]()
         for name in self._names:
-            for move in self._drift.moves(
-                collection.rig.cameras[name],
+            look = self._drift.look(
+                rig.cameras[name],
                 [found.frames[name].depth for found in collection.sets],
                 collection.sets[0].frames[name].header.depth_scale_m,
-            ):
-                if self._drift.confirmed(move):
-                    moved.append(move)
-                elif move.moved:
-                    self._log.warning("the next scan decides: %s", move.words())
+            )
+            if look is not None:
+                looks[name] = look
+        changed, moves = compared(looks, self._names)
+        moved = [move for move in moves if self._drift.confirmed(move)]
+        for move in moves:
+            if move.moved and move not in moved:
+                self._log.warning("the next scan decides: %s", move.words())
         if len(moved) == len(self._names) and (words := depths_words(moved)):
             raise CalibrationError(words)
         if moved:
@@ -239,6 +251,10 @@ class ScanWriter:
                 f"{'; '.join(move.words() for move in moved)}; put the camera back and run station "
                 "check, or run station calibrate"
             )
+        if changed and changed.too_large:
+            raise CalibrationError(changed.words())
+        self._remarks = [(rig.created, changed.words())] if changed else []
+        return changed.corrected(rig) if changed else rig
 
     def _failed(self, order: Order, reason: str) -> None:
         """The scan failed, unless its bundle got into the queue before the error."""

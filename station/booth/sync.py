@@ -66,8 +66,7 @@ class SyncProcess:
         self._checks = {name: FrameCheck(replays=name in config.recorded) for name in self._names}
         self._serials: dict[str, str] = {}
         self._live = LiveCloud(config.calibration, config.sync.live_hz)
-        drift = DriftWatch(CalibrationStore.of(config))
-        self._writer = ScanWriter(config, drift, log)
+        self._writer = ScanWriter(config, DriftWatch(CalibrationStore.of(config)), log)
         self._order: Order | None = None
         """Started, but its frames are not being collected yet."""
         self._collection: Collection | None = None
@@ -322,6 +321,7 @@ class SyncProcess:
                 *filter(None, [self._writer.stalled(now_s), self._too_slow(now_s)]),
                 *(self._wrong_sensors(rig) if (rig := self._live.rig) else []),
             ],
+            "remarks": self._writer.remarks(rig),
             "framesets": self._set_count,
             "framesets_hz": rate_hz(self._set_times_s, now_s),
             "latency_p50_s": latencies[len(latencies) // 2] if latencies else None,

@@ -81,6 +81,9 @@ class UnitError:
     """Relative error of all inverse depths: a baseline or a focal length that is slightly off."""
     curvature: float = 0.0
     """Error of the inverse depth where it is 1 / m off that of 1.7 m, growing with the square."""
+    warmth: tuple[float, int] = (0.0, 0)
+    """By which share depths of 2.5 m are larger at another temperature, and with which power of the
+    depth this share grows."""
     smooth: SmoothBias | None = None
     zero_plane: ZeroPlane | None = None
     frozen_share: float = 0.0
@@ -106,6 +109,9 @@ class UnitError:
         shape = 1.0 + self.tilt[0] * x + self.tilt[1] * y
         off = 0.25 * self.bias_m * shape * np.square(depth_m) + self.gain * depth_m
         off = off + self.curvature * np.square(1.0 - depth_m / _MIDDLE_M)
+        share, power = self.warmth
+        if share:
+            off = off + share * depth_m * (np.maximum(depth_m, _RANGE_M[0]) / 2.5) ** power
         if self.smooth is not None:
             off = off + self.smooth.offset_m(x, y, depth_m)
         return off

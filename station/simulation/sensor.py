@@ -59,6 +59,8 @@ class SimulatedBooth:
     walls: bool = True
     violations: frozenset[str] = frozenset()
     """Names of `station.simulation.violations` that are switched on."""
+    warmth: float = 0.0
+    """Mean share by which depths of 2.5 m are larger than when the booth was calibrated."""
     uneven_floor_m: float = 0.0
     uneven_board_m: float = 0.0
     """Unevenness of the floor, and of a board held up in the booth, rms."""
@@ -108,6 +110,7 @@ class SimulatedUnit:
                 booth.bias_m * rng.uniform(-1.0, 1.0),
                 tuple(rng.uniform(-0.3, 0.3, 2)),
                 *_with_gain(made if booth.bias_m else np.zeros(2), booth, index),
+                _warmth(booth, index),
                 violations.smooth_bias(booth.violations, booth.seed, index),
                 violations.zero_plane(booth.violations, booth.seed, index),
                 violations.frozen_share(booth.violations),
@@ -129,6 +132,13 @@ class SimulatedUnit:
 def _with_gain(made: Array, booth: SimulatedBooth, index: int) -> tuple[float, float]:
     extra = violations.extra_gain(booth.violations, booth.seed, index)
     return float(made[0]) + extra, float(made[1])
+
+
+def _warmth(booth: SimulatedBooth, index: int) -> tuple[float, int]:
+    """A unit's share of the booth's warmth, and the law: a constant, in proportion to the depth, or
+    to its square."""
+    own = np.random.default_rng((booth.seed, index, 13)).uniform(0.6, 1.4)
+    return booth.warmth * own, int(np.random.default_rng((booth.seed, 13)).integers(-1, 2))
 
 
 class VirtualCamera:

@@ -69,6 +69,7 @@ def test_a_scan_that_waits_for_the_compiler_says_so(fresh: Page, console: LiveCo
     fresh.route("**/api/v1/booth", first)
     log_in(fresh, console)
     open_view(fresh, console, "scan")
+    expect(fresh.locator("#go")).to_be_enabled(timeout=LONG_MS)
     fresh.evaluate(_NOTE_WORDS, "p:not([hidden])")
     fresh.click("#go")
     expect(fresh.locator("#verdict")).to_be_visible(timeout=5 * LONG_MS)

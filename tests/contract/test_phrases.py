@@ -31,6 +31,7 @@ SPEAKERS = (
     "station/core/spool.py", "station/messaging/transport.py",
     "station/core/depth/intrinsics.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
+    "station/calibration/drift/depths.py",
     "station/calibration/drift/people.py",
     "station/calibration/guide/attempt.py", "station/calibration/guide/procedure.py",
     "station/calibration/guide/raised_ball.py",

@@ -104,7 +104,7 @@ def test_a_scan_is_not_compared_with_the_booth_of_another_calibration(
     watch.prepare(camera)
     store.use(names[1])
     with pytest.raises(CalibrationError, match="another calibration was put into use"):
-        watch.moves(camera, [np.full((480, 640), 20002, np.uint16)] * 2, 1e-4)
+        watch.look(camera, [np.full((480, 640), 20002, np.uint16)] * 2, 1e-4)
     watch.prepare(moved)
 
 

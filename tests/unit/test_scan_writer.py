@@ -20,7 +20,7 @@ from station.booth import scan_writer
 from station.booth.collection import Collection, Order
 from station.booth.frameset import Frameset
 from station.booth.scan_writer import Ended, ScanWriter, Started
-from station.calibration.drift.motion import CameraMove
+from station.calibration.drift.look import Look
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.config import BoothConfig
@@ -77,12 +77,12 @@ class _LongCheck(DriftWatch):
         super().__init__(store)
         self.begun, self.end = threading.Event(), threading.Event()
 
-    def moves(
+    def look(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
-    ) -> list[CameraMove]:
+    ) -> Look | None:
         self.begun.set()
         assert self.end.wait(20.0)
-        return super().moves(camera, frames, scale_m)
+        return super().look(camera, frames, scale_m)
 
 
 def test_a_long_check_for_moved_cameras_is_no_slow_disk(one_camera: BoothConfig) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from seen_balls import CAMERAS, ball
 
 from station.calibration.detect.detections import Observations
-from station.calibration.detect.scene import StaticView, static_view
+from station.calibration.detect.scene import StaticView, mean_view, static_view
 from station.calibration.detect.step_names import EMPTY, MARK
 from station.calibration.detect.warmth import common_change, depth_change
 from station.calibration.guide.session import JOURNAL, Session
@@ -57,21 +57,20 @@ def test_depths_that_changed_are_seen_with_somebody_in_view(
     empty: StaticView, change: float, besides: tuple[Any, ...]
 ) -> None:
     view = VirtualScene((*ROOM, *besides)).view(CAMERA, CAMERA.world_from_camera)
-    found = depth_change(_frames(view, change, seed=3), DEPTH_SCALE_M, empty)
+    found = depth_change(*mean_view(_frames(view, change, seed=3), DEPTH_SCALE_M), empty)
     assert found == pytest.approx(change, abs=1e-4)
 
 
 def test_another_booth_says_nothing_of_the_depths(empty: StaticView) -> None:
     nearer = np.asarray(0.5 * empty.depth_m() / DEPTH_SCALE_M, np.uint16)
-    assert depth_change([nearer] * 3, DEPTH_SCALE_M, empty) is None
-    assert depth_change([], DEPTH_SCALE_M, empty) is None
+    assert depth_change(*mean_view([nearer] * 3, DEPTH_SCALE_M), empty) is None
 
 
 def test_curtains_that_hang_otherwise_say_nothing_of_the_depths(empty: StaticView) -> None:
     rows = np.arange(480)[:, None]
     hung = empty.depth_m() * (1.0 + 5e-3 * np.sign(np.sin(rows / 40.0 * np.pi)))
     frames = [np.asarray(hung / DEPTH_SCALE_M, np.uint16)] * 3
-    assert depth_change(frames, DEPTH_SCALE_M, empty) is None
+    assert depth_change(*mean_view(frames, DEPTH_SCALE_M), empty) is None
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,12 @@ def _frames(depth: int) -> list[np.ndarray]:
     return [np.broadcast_to(depth + slant, (480, 640)).astype(np.uint16)] * 3
 
 
+def _move(watch: DriftWatch, depth: int) -> CameraMove:
+    look = watch.look(CAMERA, _frames(depth), 1e-4)
+    assert look is not None
+    return look.move()
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> CalibrationStore:
     store = CalibrationStore(tmp_path / "calibrations", tmp_path / "calibration.json")
@@ -44,13 +50,13 @@ def store(tmp_path: Path) -> CalibrationStore:
 def test_another_calibration_brings_its_own_empty_booth(store: CalibrationStore) -> None:
     watch = DriftWatch(store)
     store.use("20261101T100000Z")
-    [move] = watch.moves(CAMERA, _frames(20000), 1e-4)
+    move = _move(watch, 20000)
     assert not move.moved
-    assert watch.moves(default_rig().cameras["back-upper"], _frames(20000), 1e-4) == []
-    [move] = watch.moves(CAMERA, _frames(30000), 1e-4)
+    assert watch.look(default_rig().cameras["back-upper"], _frames(20000), 1e-4) is None
+    move = _move(watch, 30000)
     assert move.lost or move.moved
     store.use("20261102T100000Z")
-    [move] = watch.moves(CAMERA, _frames(30000), 1e-4)
+    move = _move(watch, 30000)
     assert not move.moved
     assert not move.lost
 
@@ -65,9 +71,9 @@ def test_what_is_prepared_is_not_prepared_by_a_scan(
     watch.prepare(default_rig().cameras["back-upper"])  # nothing was stored of it
     with monkeypatch.context() as again:
         again.delattr(DriftReference, "prepare")
-        assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+        assert watch.look(CAMERA, _frames(20000), 1e-4)
     store.use("20261102T100000Z")
-    [move] = watch.moves(CAMERA, _frames(30000), 1e-4)
+    move = _move(watch, 30000)
     assert not move.moved
 
 
@@ -75,7 +81,7 @@ def test_images_of_another_size_are_refused(store: CalibrationStore) -> None:
     store.use("20261101T100000Z")
     watch = DriftWatch(store)
     with pytest.raises(CalibrationError, match="camera front-lower gives images of 320 x 240"):
-        watch.moves(CAMERA, [frame[::2, ::2] for frame in _frames(20000)], 1e-4)
+        watch.look(CAMERA, [frame[::2, ::2] for frame in _frames(20000)], 1e-4)
 
 
 def test_a_torn_scene_refuses_scans_until_it_is_whole(store: CalibrationStore) -> None:
@@ -88,9 +94,9 @@ def test_a_torn_scene_refuses_scans_until_it_is_whole(store: CalibrationStore) -
         with pytest.raises(
             CalibrationError, match=r"checked for moved .*front-lower.npz cannot be read"
         ):
-            watch.moves(CAMERA, _frames(20000), 1e-4)
+            watch.look(CAMERA, _frames(20000), 1e-4)
     path.write_bytes(whole)
-    assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+    assert watch.look(CAMERA, _frames(20000), 1e-4)
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.EACCES])
@@ -103,8 +109,8 @@ def test_a_folder_that_cannot_be_read_is_not_taken_for_an_empty_one(
     with monkeypatch.context() as disk:
         _break(disk, store.folder / place, code)
         with pytest.raises(CalibrationError, match="could not be checked for moved cameras"):
-            watch.moves(CAMERA, _frames(20000), 1e-4)
-    assert len(watch.moves(CAMERA, _frames(20000), 1e-4)) == 1
+            watch.look(CAMERA, _frames(20000), 1e-4)
+    assert watch.look(CAMERA, _frames(20000), 1e-4)
 
 
 def _break(disk: pytest.MonkeyPatch, folder: Path, code: int) -> None:
@@ -125,7 +131,7 @@ def _break(disk: pytest.MonkeyPatch, folder: Path, code: int) -> None:
 def test_without_a_stored_scene_there_is_nothing_to_check(store: CalibrationStore) -> None:
     store.use("20261101T100000Z")
     shutil.rmtree(store.folder)
-    assert DriftWatch(store).moves(CAMERA, _frames(20000), 1e-4) == []
+    assert DriftWatch(store).look(CAMERA, _frames(20000), 1e-4) is None
 
 
 def _estimate(size: float, camera: str = "a") -> CameraMove:
@@ -180,8 +186,8 @@ def test_two_alarms_that_contradict_each_other_are_no_move() -> None:
 def test_doubts_end_with_their_calibration(store: CalibrationStore) -> None:
     watch = DriftWatch(store)
     store.use("20261101T100000Z")
-    watch.moves(CAMERA, _frames(20000), 1e-4)
+    watch.look(CAMERA, _frames(20000), 1e-4)
     assert not watch.confirmed(_estimate(1.2))
     store.use("20261102T100000Z")
-    watch.moves(CAMERA, _frames(20000), 1e-4)
+    watch.look(CAMERA, _frames(20000), 1e-4)
     assert not watch.confirmed(_estimate(1.2))

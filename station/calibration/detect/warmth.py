@@ -7,17 +7,16 @@ noise, so that their readings show a change of a few hundredths of a per cent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.scene import StaticView, mean_view
+from station.calibration.detect.scene import StaticView
+from station.core.depth.images import Image
 
-TELLING = 5e-4
-"""Change of all cameras' depths by which girths are wrong that are stated to a few millimetres."""
-GIRTH_M_PER_CHANGE = 7.0
-"""Metres by which a girth of a metre is too small where depths are larger by a share of 1."""
+BODY_M = 1.7
+"""Distance of a body from the cameras."""
 _SAME_PER_M = 0.01
 """Readings that differ by more, 1/m, are of somebody or something that was not there."""
 _ALWAYS = 0.9
@@ -30,9 +29,7 @@ _LARGEST_ERROR = 1e-4
 """Standard error beyond which what is seen does not stand still, such as curtains."""
 
 
-def depth_change(
-    frames: Sequence[NDArray[np.uint16]], scale_m: float, empty: StaticView
-) -> float | None:
+def depth_change(mean: Image, share: Image, empty: StaticView) -> float | None:
     """Relative change of the depths since the empty booth was recorded: 1e-3 if all surfaces seem
     to be 0.1 % farther away; None where too little of it is seen, or does not stand still.
 
@@ -40,11 +37,9 @@ def depth_change(
     step of the disparity.
 
     Args:
-        frames: (h, w) each, of a camera that has not moved; people may stand in its view.
+        mean, share: see `station.calibration.detect.scene.mean_view`, of a camera that has not
+            moved; people may stand in its view.
     """
-    if not len(frames):
-        return None
-    mean, share = mean_view(frames, scale_m)
     before = empty.inverse_depth / np.maximum(empty.share, _ALWAYS)
     fallen = before - mean / np.maximum(share, _ALWAYS)
     both = (share > _ALWAYS) & (empty.share > _ALWAYS) & (before > 0)
@@ -68,6 +63,11 @@ def common_change(changes: Mapping[str, float]) -> float:
         return 0.0
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return 0.0 if low < 0.0 < high else min(low, high, key=abs)
+
+
+def where_words(change: float) -> str:
+    """Words on where things seem to be whose depths changed so."""
+    return "farther away" if change > 0.0 else "nearer"
 
 
 def _in_blocks(image: NDArray[np.generic]) -> NDArray[np.float64]:

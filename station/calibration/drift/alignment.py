@@ -26,10 +26,10 @@ from station.core.lens import project
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_CORRELATION = 2.5
+CORRELATION = 2.5
 """Samples after a blur of 3.4 px (the sensor's window and ours) are nearly independent; the
 variances of their sums are this much larger."""
-_FLOOR_PER_M = 2e-5
+FLOOR_PER_M = 2e-5
 """Error that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
 _COMMON_SIGMA = np.array([5e-5, 1e-4, 1.0, 1.0])
 """Standard deviations of `DriftReference.common`: warmth changes the depth of a warm sensor by
@@ -130,8 +130,8 @@ class _Samples:
         # The frozen share does not average out, and a camera that moves sees it change.
         share = 2.0 * FROZEN_SHARE
         share += (1.0 - FROZEN_SHARE) * (1.0 / frames + 1.0 / reference.frames)
-        variance = reference.noise.ravel()[at] ** 2 * share + _FLOOR_PER_M**2
-        sigma = np.sqrt(_CORRELATION * variance)
+        variance = reference.noise.ravel()[at] ** 2 * share + FLOOR_PER_M**2
+        sigma = np.sqrt(CORRELATION * variance)
         columns = (reference.jacobian, reference.common, reference.local)
         design = np.concatenate([c.reshape(-1, c.shape[-1])[at] for c in columns], axis=1)
         starts = np.flatnonzero(np.diff(block, prepend=-1))

@@ -10,15 +10,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from station.calibration.detect.warmth import (
-    GIRTH_M_PER_CHANGE,
-    TELLING,
-    common_change,
-    depth_change,
-)
-from station.calibration.drift.estimate import estimate_move
+from station.calibration.drift.depths import ChangedDepths, SeenDepths
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.last_check import keep_check
+from station.calibration.drift.look import Look, compared
 from station.calibration.drift.motion import CameraMove, depths_words, move_words
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
@@ -70,11 +65,11 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     if correct:
         _correct(config)
         return
-    moves, depths = _moves(config, recordings, quiet=as_json)
+    looks, depths, moves = _compared(config, recordings, quiet=as_json)
     changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
     if as_json:
-        click.echo(json.dumps([_document(move, depths.get(move.camera)) for move in moves]))
+        click.echo(json.dumps([_document(move, looks[move.camera].depths) for move in moves]))
     else:
         _tell(moves, changed, depths, moved=moved)
     if recordings is None:
@@ -103,11 +98,11 @@ def _correct(config: BoothConfig) -> None:
     )
 
 
-def _moves(
+def _compared(
     config: BoothConfig, recordings: Path | None, quiet: bool
-) -> tuple[list[CameraMove], dict[str, float]]:
-    """Estimates of how far each camera stands from where it was calibrated, and relative changes of
-    its depths by camera, where they show.
+) -> tuple[dict[str, Look], ChangedDepths | None, list[CameraMove]]:
+    """Looks of all cameras, the change of their depths, if there is one, and estimates of how far
+    each stands from where it was calibrated.
 
     Raises:
         CalibrationError: cameras or sensors are not those of the calibration, or its picture of
@@ -127,20 +122,18 @@ def _moves(
     source = replayed_feed(config, recordings) if recordings else live_feed(config)
     with source as feed:
         taken = _look(feed, rig, names, quiet)
-    moves, depths = list[CameraMove](), dict[str, float]()
+    looks = dict[str, Look]()
     for name, frames in taken.items():
-        pixels, scale_m = [frame.pixels() for frame in frames], frames[0].scale_m
-        camera = rig.camera(name, str(config.calibration))
-        moves.append(estimate_move(DriftReference.prepare(camera, scene[name]), pixels, scale_m))
-        if (change := depth_change(pixels, scale_m, scene[name])) is not None:
-            depths[name] = change
-    return moves, depths
+        reference = DriftReference.prepare(rig.camera(name, str(config.calibration)), scene[name])
+        pixels = [frame.pixels() for frame in frames]
+        looks[name] = Look.of(reference, scene[name], pixels, frames[0].scale_m)
+    return looks, *compared(looks, names)
 
 
 def _tell(
     moves: list[CameraMove],
     changed: list[CameraMove],
-    depths: Mapping[str, float],
+    depths: ChangedDepths | None,
     *,
     moved: bool,
 ) -> None:
@@ -148,7 +141,7 @@ def _tell(
         click.echo(move.words())
     for line in _unseen_lines(moves):
         click.echo(f"  {line}")
-    words = depths_words(moves) or _depths_line(depths)
+    words = depths_words(moves) or (depths.words() if depths else "")
     if words:
         click.echo(words)
     if changed:
@@ -162,20 +155,6 @@ def _tell(
     elif not moved:
         order = "" if words else "the booth is in order: "
         click.echo(f"{order}no camera has moved, as far as their views can show")
-
-
-def _depths_line(depths: Mapping[str, float]) -> str:
-    """Line on depths that all cameras see changed; "" where they are as at the calibration."""
-    change = common_change(depths)
-    if abs(change) <= TELLING:
-        return ""
-    return (
-        f"all cameras see the booth {100.0 * abs(change):.2f} % "
-        f"{'farther away' if change > 0.0 else 'nearer'} than when they were calibrated: girths "
-        f"come out about {1e3 * GIRTH_M_PER_CHANGE * abs(change):.0f} mm too "
-        f"{'small' if change > 0.0 else 'large'}; let the sensors warm up for 20 minutes, and "
-        "check again; if nothing changes, run station calibrate"
-    )
 
 
 def _unseen_lines(moves: Sequence[CameraMove]) -> list[str]:
@@ -214,7 +193,7 @@ def _look(feed: Feed, rig: Rig, names: list[str], quiet: bool) -> dict[str, list
     return taken
 
 
-def _document(move: CameraMove, change: float | None) -> dict[str, object]:
+def _document(move: CameraMove, depths: SeenDepths | None) -> dict[str, object]:
     return {
         "camera": move.camera,
         "moved": move.moved,
@@ -224,6 +203,6 @@ def _document(move: CameraMove, change: float | None) -> dict[str, object]:
         "translation_m": move.xi[3:].tolist(),
         "sigma": np.sqrt(np.diag(move.stated)).tolist(),
         "background_share": move.share,
-        "depth_change": change,
+        "depth_change": None if depths is None else depths.at_walls,
         "unseen": move.unseen_words(),
     }

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from station.calibration.detect.warmth import where_words
+
 Array = NDArray[np.float64]
 
 MOVED_M = 0.005
@@ -206,8 +208,13 @@ def depths_words(moves: Sequence[CameraMove]) -> str | None:
     along_m = np.array([shift_m for shift_m, _ in fits])
     if np.any(np.sign(along_m) != np.sign(along_m[0])):
         return None
+    return everything_words(-float(along_m[0]))
+
+
+def everything_words(change: float) -> str:
+    """Words on depths of all cameras that changed so much that no scan is taken."""
     return (
-        f"all cameras see everything {'nearer' if along_m[0] > 0.0 else 'farther away'} than when "
+        f"all cameras see everything {where_words(change)} than when "
         "they were calibrated, as sensors do that are colder or warmer: let them warm up for 20 "
         "minutes, and try again; if nothing changes, run station calibrate"
     )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView
-from station.calibration.drift.estimate import estimate_move
+from station.calibration.drift.look import Look
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.store import CalibrationStore
@@ -73,10 +73,10 @@ class DriftWatch:
         if camera.name not in self._references:
             self._references[camera.name] = DriftReference.prepare(camera, self._views[camera.name])
 
-    def moves(
+    def look(
         self, camera: CameraCalibration, frames: Sequence[NDArray[np.uint16]], scale_m: float
-    ) -> list[CameraMove]:
-        """The camera's displacement from frames of one moment; empty where nothing was stored.
+    ) -> Look | None:
+        """Look at frames of one moment; None where nothing was stored of the camera.
 
         Raises:
             CalibrationError: as `prepare`; or the camera's images are of another size than when it
@@ -85,14 +85,14 @@ class DriftWatch:
         self.prepare(camera)
         view = self._views.get(camera.name)
         if view is None:
-            return []
+            return None
         if frames[0].shape != view.inverse_depth.shape:
             height, width = frames[0].shape
             raise CalibrationError(
                 f"camera {camera.name} gives images of {width} x {height}, not those that it was "
                 "calibrated with; run station calibrate"
             )
-        return [estimate_move(self._references[camera.name], frames, scale_m)]
+        return Look.of(self._references[camera.name], view, frames, scale_m)
 
     def _follow(self) -> None:
         try:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from station.calibration.detect.coverage import Coverage
 from station.calibration.detect.detections import BallDetection, PlaneObservation
 from station.calibration.detect.planes import observe_floor, observe_wall
-from station.calibration.detect.scene import StaticView, static_view
+from station.calibration.detect.scene import StaticView, mean_view, static_view
 from station.calibration.detect.step_names import EMPTY, HANGING, WALL, numbered_step
 from station.calibration.detect.stillness import check_board_stands, check_stillness
 from station.calibration.detect.swing import GAP_S, LOOK_S, since_last_gap, whole_swings
@@ -334,8 +334,8 @@ def _depth_changes(
         looked: each camera's frames (h, w), and their scale.
     """
     changes = {
-        name: depth_change([*frames], scale_m, empty[name])
+        name: depth_change(*mean_view(seen, scale_m), empty[name])
         for name, (frames, scale_m) in looked.items()
-        if name in empty
+        if name in empty and (seen := [*frames])
     }
     return {name: change for name, change in changes.items() if change is not None}

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from station.calibration.detect.warmth import TELLING, common_change
+from station.calibration.detect.warmth import BODY_M, common_change, where_words
 from station.calibration.solve.refusals import SIGMAS_95
 from station.core.errors import CalibrationError
 from station.core.rig import PredictedError
@@ -20,10 +20,9 @@ Changes = Mapping[str, Mapping[str, float]]
 """Step -> camera -> relative change of its depths since the empty booth was recorded; the steps in
 the order in which they were done."""
 
-_REMARKED, _NOISE = 2e-4, 1e-4
-"""Changes that are remarked upon, and up to which the comparison errs."""
-_BODY_M = 1.7
-"""Distance of a body from the cameras."""
+_MOST, _REMARKED, _NOISE = 5e-4, 2e-4, 1e-4
+"""Changes by which girths are wrong that are stated to a few millimetres (7 mm for 0.1 %), that are
+remarked upon, and up to which the comparison errs."""
 
 
 def check_warm(changes: Changes) -> None:
@@ -32,7 +31,7 @@ def check_warm(changes: Changes) -> None:
     Raises:
         CalibrationError: by how much, and what to do.
     """
-    if abs(change := _largest(changes)) > TELLING:
+    if abs(change := _largest(changes)) > _MOST:
         raise _too_much(change)
 
 
@@ -47,7 +46,7 @@ def widen_by_warming(
     """
     if abs(change := _largest(changes)) <= _NOISE:
         return predicted
-    widened = predicted.widened(abs(change) * _BODY_M)
+    widened = predicted.widened(abs(change) * BODY_M)
     if SIGMAS_95 * widened.girth_sigma_m > girth_limit_m:
         raise _too_much(change)
     return widened
@@ -59,7 +58,8 @@ def warming_words(changes: Changes) -> str:
         return ""
     return (
         "for girths, let the sensors warm up for 20 minutes before the first step: all cameras "
-        f"saw the booth {_percent(change)} % {_where(change)} in one step than in an earlier one"
+        f"saw the booth {_percent(change)} % {where_words(change)} in one step than in an earlier "
+        "one"
     )
 
 
@@ -74,15 +74,11 @@ def _largest(changes: Changes) -> float:
 
 def _too_much(change: float) -> CalibrationError:
     return CalibrationError(
-        f"all cameras saw the booth {_percent(change)} % {_where(change)} in one step than in an "
-        "earlier one, as sensors do that are colder or warmer: let them warm up for 20 minutes; "
+        f"all cameras saw the booth {_percent(change)} % {where_words(change)} in one step than in "
+        "an earlier one, as sensors do that are colder or warmer: let them warm up for 20 minutes; "
         "start again with station calibrate --new"
     )
 
 
 def _percent(change: float) -> str:
     return f"{100.0 * abs(change):.2f}"
-
-
-def _where(change: float) -> str:
-    return "farther away" if change > 0.0 else "nearer"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from station.core.depth.field import DepthField
 from station.core.depth.json_values import array_of
@@ -18,6 +18,8 @@ POLYNOMIAL, FIELD = "inverse-depth-poly", "inverse-depth-field"
 """Models of depth correction, beside "none"."""
 _MAX_COEFFICIENTS = 16
 """The solution uses five; powers beyond cannot be told from rounding."""
+_NEWTON = 3
+"""Steps after which changes of a few per cent are undone to rounding."""
 _DEPTHS_M = np.linspace(0.5, 4.0, 36)
 """At which a correction must leave readings: a booth's."""
 
@@ -66,6 +68,23 @@ class DepthCorrection:
         if self.field is not None:
             corrected = corrected + self.field.at(inverse, x, y)
         return np.asarray(corrected)
+
+    def after(self, law: ArrayLike) -> DepthCorrection:
+        """The correction of a sensor whose inverse depths w have changed since: this one of
+        w + law[0] + law[1] w + ...
+
+        A field is followed to first order between its knots.
+        """
+        polynomial = np.polynomial.Polynomial
+        before = polynomial([0.0, 1.0]) + polynomial(np.asarray(law))
+        coefficients = polynomial(self.coefficients or (0.0, 1.0))(before).coef
+        field = self.field
+        if field is not None:
+            knots = np.array(field.knots)
+            for _ in range(_NEWTON):
+                knots = knots - (before(knots) - field.knots) / before.deriv()(knots)
+            field = replace(field, knots=tuple(knots.tolist()))
+        return replace(self, coefficients=tuple(coefficients.tolist()), field=field)
 
     def to_json(self) -> dict[str, Any]:
         if not self.coefficients:
