@@ -112,7 +112,8 @@ class DriftConfig(Strict):
     """Whether cameras still stand where they were calibrated."""
 
     refuse_scans: bool = Field(
-        default=True, description="a scan is refused when its background says that a camera moved, and corrected "
+        default=True,
+        description="a scan is refused when its background says that a camera moved, and corrected "
         "where depths changed; otherwise the background is not looked at",
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.scene import StaticView, static_view
-from station.calibration.drift.depths import ChangedDepths
+from station.calibration.drift.depths import ChangedDepths, SeenDepths, changed_depths
 from station.calibration.drift.look import Look, compared
 from station.calibration.drift.motion import depths_words
 from station.calibration.drift.reference import DriftReference
@@ -110,6 +110,15 @@ def test_a_camera_that_sees_nothing_of_the_booth_changes_as_the_others_do(
     assert changed is not None
     change = np.polynomial.polynomial.polyval(1.0 / 1.7, changed.laws["front-lower"]) * 1.7
     assert change == pytest.approx(1.5e-3, rel=0.4)
+
+
+@pytest.mark.parametrize(("at_body", "agree"), [(6e-4, True), (-1e-3, False), (3e-3, False)])
+def test_cameras_that_were_all_turned_a_little_show_no_change(at_body: float, agree: bool) -> None:
+    """Floors seemed nearer or farther away, and bodies were to be shifted by 5 mm."""
+    walls_and_body = np.stack([0.3 ** (np.arange(3.0) - 1.0), 1.7 ** (1.0 - np.arange(3.0))])
+    sure = 1e10 * walls_and_body.T
+    seen = SeenDepths(3e-4, sure @ walls_and_body, sure @ [3e-4, at_body])
+    assert (changed_depths(dict.fromkeys(RIG.cameras, seen)) is not None) == agree
 
 
 def test_a_large_change_is_told_as_one_that_no_scan_is_taken_with() -> None:

@@ -41,6 +41,9 @@ _TERMS, _WALLS_W = 3, 0.3
 _ALL, _UNITS = 1.0, 0.5
 """Standard deviations of a term of all units, and of one unit's from it, as shares of what the
 walls show."""
+_MOST_OF_WALLS = 3.0
+"""Largest change of a body as a multiple of what walls show: a constant one gives 2. Cameras that
+were all turned a little show more, or the opposite."""
 _OF_CHANGE = 0.1
 """Error of the correction as a share of the change: its law may be another one."""
 _SAME_PER_M = 0.01
@@ -175,16 +178,18 @@ def changed_depths(looks: Mapping[str, SeenDepths | None]) -> ChangedDepths | No
         vector = vector + kept @ one.vector
     covariance = np.linalg.inv(information)
     law = covariance @ vector
+    at_body = BODY_M ** (1.0 - np.arange(_TERMS))
+    change = float(at_body @ law)
+    if not 0.0 < change / at_walls < _MOST_OF_WALLS:
+        return None
     laws = {
         name: law if one is None else posterior[name] @ (one.vector + own @ law)
         for name, one in looks.items()
     }
-    at_body = BODY_M ** (1.0 - np.arange(_TERMS))
     variances = [
         at_body @ (posterior[name] + posterior[name] @ own @ covariance @ own @ posterior[name])
         @ at_body
         for name in seen
     ]  # fmt: skip
-    change = float(at_body @ law)
     sigma = np.sqrt(np.mean(variances) + (_OF_CHANGE * change) ** 2)
     return ChangedDepths(at_walls, laws, float(sigma) * BODY_M)
