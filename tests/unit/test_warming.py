@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,9 +17,13 @@ from station.calibration.detect.detections import Observations
 from station.calibration.detect.scene import StaticView, mean_view, static_view
 from station.calibration.detect.step_names import EMPTY, MARK
 from station.calibration.detect.warmth import common_change, depth_change
+from station.calibration.guide.attempt import Attempt
+from station.calibration.guide.operator import Guide
 from station.calibration.guide.session import JOURNAL, Session
+from station.calibration.guide.store import CalibrationStore
 from station.calibration.solve.solving import solve
 from station.calibration.solve.warming import check_warm, warming_words, widen_by_warming
+from station.core.config import BoothConfig
 from station.core.errors import CalibrationError, FormatError
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import PredictedError
@@ -189,6 +194,20 @@ def test_a_slight_change_widens_what_is_stated() -> None:
     assert 1.96 * np.sqrt(widened.girth_sigma_m**2 - SAID.girth_sigma_m**2) > 2.1e-3
     with pytest.raises(CalibrationError, match="warm up for 20 minutes"):
         widen_by_warming(SAID, changes, 3e-3)
+
+
+def test_the_next_step_tells_what_the_solution_will_be_refused_for(
+    session: Session, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All the other steps were done in vain."""
+    store = CalibrationStore(session.folder, session.folder / "calibration.json")
+    guide = Guide(attended=False, countdown_s=0.0)
+    attempt = Attempt(cast(BoothConfig, SimpleNamespace()), store, None, guide)
+    attempt.remark_on_warmth(session)
+    assert capsys.readouterr().out == ""
+    _rest(session, MARK, **dict.fromkeys(("front_lower", "front_upper", "back_lower"), 9e-4))
+    attempt.remark_on_warmth(session)
+    assert "0.09 % farther away in one step" in capsys.readouterr().out
 
 
 def test_a_solution_is_not_begun_with_sensors_that_warmed_up() -> None:

@@ -121,11 +121,23 @@ class Attempt:
                 "ball (run station calibrate floor)"
             )
 
+    def remark_on_warmth(self, session: Session) -> None:
+        """Say so where the solution will be refused for what the steps so far saw of the depths,
+        minutes before it is."""
+        from station.calibration.solve.warming import check_warm
+
+        try:
+            check_warm(session.depth_changes)
+        except CalibrationError as error:
+            self.guide.say(str(error))
+
     @contextmanager
     def feed(self, step: str) -> Iterator[tuple[Feed, Session]]:
         """Frames for a step and the calibration that is being done; begun if there is none."""
         with self._source(step) as feed:
-            yield feed, self._joined(step, feed.cameras(_SENSORS_S))
+            session = self._joined(step, feed.cameras(_SENSORS_S))
+            self.remark_on_warmth(session)
+            yield feed, session
 
     def _source(self, step: str) -> AbstractContextManager[Feed]:
         if self.recordings is None:
