@@ -144,5 +144,9 @@ def test_a_scan_by_warmer_sensors_is_corrected(
         correction = used.cameras[name].depth_correction
         assert correction != camera.depth_correction
         assert correction.apply(np.full((480, 640), 2.5))[240, 320] < 2.499
-    said = station.command("status").stdout
-    assert "farther away than when they were calibrated" in said, said
+    for command in ("status", "check"):
+        said = station.command(command).stdout
+        assert "farther away than when they were calibrated" in said, said
+    kept = last_check(station.config.parent / "console")
+    assert kept is not None
+    assert "farther away" in kept["depths"]

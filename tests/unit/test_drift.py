@@ -402,7 +402,7 @@ def test_cameras_that_share_unseen_directions_are_told_together(
     *first, last = moves[0].unseen_words()
     words = f"{', '.join(first)} or {last}" if first else last
     assert "shift sideways" in words
-    check_cli._tell(moves, [], None, moved=False)
+    check_cli._tell(moves, [], "", moved=False)
     assert capsys.readouterr().out.splitlines() == [
         *(f"camera {name} stands where it was calibrated" for name in "abc"),
         f"  cameras a, c: a small {words} cannot be detected",
@@ -424,7 +424,7 @@ def test_depths_that_changed_are_told(
 ) -> None:
     """Girths were 7 mm off where nothing showed it."""
     moves = [CameraMove(name, np.zeros(6), 1e-8 * np.eye(6), 1.0) for name in "abcd"]
-    depths = ChangedDepths(change, {}, 1e-3) if change else None
+    depths = ChangedDepths(change, {}, 1e-3).words() if change else ""
     check_cli._tell(moves, [], depths, moved=False)
     out = capsys.readouterr().out
     assert ("all cameras see the booth" in out) == bool(words)

@@ -68,13 +68,14 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     looks, depths, moves = _compared(config, recordings, quiet=as_json)
     changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
+    words = depths_words(moves) or (depths.words() if depths else "")
     if as_json:
         click.echo(json.dumps([_document(move, looks[move.camera].depths) for move in moves]))
     else:
-        _tell(moves, changed, depths, moved=moved)
+        _tell(moves, changed, words, moved=moved)
     if recordings is None:
         try:
-            keep_check(config.console.folder, moves)
+            keep_check(config.console.folder, moves, words)
         except OSError as error:
             # What was found is told all the same, by the exit code too.
             reason = error.strerror or str(error)
@@ -133,7 +134,7 @@ def _compared(
 def _tell(
     moves: list[CameraMove],
     changed: list[CameraMove],
-    depths: ChangedDepths | None,
+    depths: str,
     *,
     moved: bool,
 ) -> None:
@@ -141,9 +142,8 @@ def _tell(
         click.echo(move.words())
     for line in _unseen_lines(moves):
         click.echo(f"  {line}")
-    words = depths_words(moves) or (depths.words() if depths else "")
-    if words:
-        click.echo(words)
+    if depths:
+        click.echo(depths)
     if changed:
         most = min(changed, key=lambda move: move.share)
         percent = 100.0 * (1.0 - most.share)
@@ -153,7 +153,7 @@ def _tell(
             "not there and put back what is missing, so that small moves can be detected"
         )
     elif not moved:
-        order = "" if words else "the booth is in order: "
+        order = "" if depths else "the booth is in order: "
         click.echo(f"{order}no camera has moved, as far as their views can show")
 
 

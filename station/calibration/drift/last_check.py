@@ -13,12 +13,17 @@ from station.core.files import private_folder, utc_now, write_json
 _FILE = "last-check.json"
 
 
-def keep_check(folder: Path, moves: Sequence[CameraMove]) -> None:
-    """Write down, in the console's folder, what a check has found now."""
+def keep_check(folder: Path, moves: Sequence[CameraMove], depths: str = "") -> None:
+    """Write down, in the console's folder, what a check has found now.
+
+    Args:
+        depths: words on depths that changed.
+    """
     found = {
         "time": utc_now(),
         "moved": [move.camera for move in moves if move.moved or move.lost],
         "changed": [move.camera for move in moves if move.changed],
+        "depths": depths,
     }
     write_json(private_folder(folder) / _FILE, found)
 

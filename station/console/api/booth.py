@@ -297,8 +297,9 @@ def _last_check(console: Console) -> Check | None:
     check = last_check(console.config.console.folder)
     if check is None:
         return None
-    # Versions that did not keep what had changed wrote files that may still be there.
-    return Check(time=check["time"], moved=check["moved"], changed=check.get("changed", []))
+    # Earlier versions kept less, in files that may still be there.
+    changed, depths = check.get("changed", []), check.get("depths", "")
+    return Check(time=check["time"], moved=check["moved"], changed=changed, depths=depths)
 
 
 def _store(console: Console) -> CalibrationStore:

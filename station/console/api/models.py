@@ -61,6 +61,7 @@ class Check(BaseModel):
     changed: list[str] = Field(
         description="cameras whose view looks too different to tell small moves"
     )
+    depths: str = Field(description="words on depths that changed; empty if they did not")
 
 
 class Delivery(BaseModel):

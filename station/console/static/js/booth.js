@@ -54,7 +54,9 @@ export async function booth(main) {
     const parts = [];
     if (last.moved.length) parts.push(t('booth.checkMoved', { names: last.moved.join(', ') }));
     if (last.changed.length) parts.push(t('booth.checkChanged', { names: last.changed.join(', ') }));
-    return parts.join(' ') || t('booth.checkGood');
+    if (!parts.length) parts.push(t('booth.checkGood'));
+    if (last.depths) parts.push(said(last.depths));
+    return parts.join(' ');
   }
 
   function show() {
