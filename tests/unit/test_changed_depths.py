@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift.depths import ChangedDepths, SeenDepths, changed_depths
@@ -41,16 +42,20 @@ def calibrated() -> dict[str, tuple[DriftReference, StaticView]]:
     return found
 
 
+PUSHED = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.010]))
+
+
 def _looks(
     calibrated: dict[str, tuple[DriftReference, StaticView]],
     share: float,
     power: int = 0,
     moved: str = "",
+    by: NDArray[np.float64] = MOVED,
 ) -> dict[str, Look]:
     """Somebody stands in a booth whose sensors are warmer than they were."""
     looks = {}
     for name, camera in RIG.cameras.items():
-        pose = camera.world_from_camera @ (MOVED if name == moved else np.eye(4))
+        pose = camera.world_from_camera @ (by if name == moved else np.eye(4))
         view = VirtualScene((*booth_walls(), BODY)).view(camera, pose)
         unit = replace(UNIT, warmth=(share * SHARES[name], power))
         rng = np.random.default_rng(2)
@@ -101,6 +106,26 @@ def test_a_camera_that_was_pushed_back_does_not_speak_for_all(
     assert compared(alone, RIG.cameras)[0] is None
 
 
+@pytest.mark.parametrize("share", [0.0, 1e-3])
+def test_a_camera_that_was_pushed_back_is_named_though_depths_changed(
+    calibrated: dict[str, tuple[DriftReference, StaticView]], share: float
+) -> None:
+    """A change of its own depths explained 10 mm, and no move was left."""
+    looks = _looks(calibrated, share, moved="front-lower", by=PUSHED)
+    _, moves = compared(looks, RIG.cameras)
+    assert [move.camera for move in moves if move.moved] == ["front-lower"]
+
+
+def test_one_camera_alone_does_not_tell_that_depths_changed(
+    calibrated: dict[str, tuple[DriftReference, StaticView]],
+) -> None:
+    """In a booth of one camera, one that was pushed back by 15 mm passed for a warm one."""
+    looks = _looks(calibrated, 0.0, moved="front-lower", by=PUSHED)
+    changed, [move] = compared({"front-lower": looks["front-lower"]}, ["front-lower"])
+    assert changed is None
+    assert move.moved
+
+
 def test_a_camera_that_sees_nothing_of_the_booth_changes_as_the_others_do(
     calibrated: dict[str, tuple[DriftReference, StaticView]],
 ) -> None:
@@ -139,13 +164,14 @@ def test_the_corrected_calibration_states_larger_errors() -> None:
     assert ChangedDepths(1e-3, {}, 5e-4).corrected(RIG).predicted is None
 
 
-@pytest.mark.parametrize("model", ["none", "polynomial", "field"])
+@pytest.mark.parametrize("model", ["none", "polynomial", "long", "field"])
 def test_a_correction_after_a_change_is_the_one_of_what_was_read_before(model: str) -> None:
     rng = np.random.default_rng(0)
     field = DepthField((0.3, 0.5, 1.0), rng.normal(0.0, 1e-3, (3, 4, 5)))
     correction = {
         "none": DepthCorrection(),
         "polynomial": DepthCorrection((1e-3, 0.998, 2e-3), (1e-3, -2e-3)),
+        "long": DepthCorrection((1e-3, 0.998, *[1e-5] * 8)),
         "field": DepthCorrection((1e-3, 0.998, 2e-3), (1e-3, -2e-3), field),
     }[model]
     now, (x, y) = rng.uniform(0.25, 1.2, 50), rng.uniform(-1.0, 1.0, (2, 50))

@@ -44,6 +44,11 @@ walls show."""
 _MOST_OF_WALLS = 3.0
 """Largest change of a body as a multiple of what walls show: a constant one gives 2. Cameras that
 were all turned a little show more, or the opposite."""
+_UNLIKE = 1.5
+"""A camera whose walls differ from the others' by more than so many times the change has moved.
+Units of one kind change by shares that differ by a factor of two at most."""
+_FEWEST_CAMERAS = 2
+"""One camera alone cannot tell whether depths changed or it was pushed back."""
 _OF_CHANGE = 0.1
 """Error of the correction as a share of the change: its law may be another one."""
 _SAME_PER_M = 0.01
@@ -166,7 +171,11 @@ def changed_depths(looks: Mapping[str, SeenDepths | None]) -> ChangedDepths | No
     """
     seen = {name: one for name, one in looks.items() if one is not None}
     at_walls = common_change({name: one.at_walls for name, one in seen.items()})
-    if 2 * len(seen) <= len(looks) or abs(at_walls) < _LEAST:
+    if abs(at_walls) < _LEAST:
+        return None
+    most = _UNLIKE * abs(at_walls)
+    seen = {name: one for name, one in seen.items() if abs(one.at_walls - at_walls) < most}
+    if 2 * len(seen) <= len(looks) or len(seen) < _FEWEST_CAMERAS:
         return None
     size = np.square(at_walls * _WALLS_W ** (1.0 - np.arange(_TERMS)))
     own = np.diag(1.0 / (_UNITS**2 * size))
@@ -182,9 +191,8 @@ def changed_depths(looks: Mapping[str, SeenDepths | None]) -> ChangedDepths | No
     change = float(at_body @ law)
     if not 0.0 < change / at_walls < _MOST_OF_WALLS:
         return None
-    laws = {
-        name: law if one is None else posterior[name] @ (one.vector + own @ law)
-        for name, one in looks.items()
+    laws = dict.fromkeys(looks, law) | {
+        name: posterior[name] @ (one.vector + own @ law) for name, one in seen.items()
     }
     variances = [
         at_body @ (posterior[name] + posterior[name] @ own @ covariance @ own @ posterior[name])

@@ -73,7 +73,8 @@ class DepthCorrection:
         """The correction of a sensor whose inverse depths w have changed since: this one of
         w + law[0] + law[1] w + ...
 
-        A field is followed to first order between its knots.
+        A field is followed to first order between its knots; powers that no file may have are
+        left out.
         """
         polynomial = np.polynomial.Polynomial
         before = polynomial([0.0, 1.0]) + polynomial(np.asarray(law))
@@ -84,7 +85,9 @@ class DepthCorrection:
             for _ in range(_NEWTON):
                 knots = knots - (before(knots) - field.knots) / before.deriv()(knots)
             field = replace(field, knots=tuple(knots.tolist()))
-        return replace(self, coefficients=tuple(coefficients.tolist()), field=field)
+        return replace(
+            self, coefficients=tuple(coefficients[:_MAX_COEFFICIENTS].tolist()), field=field
+        )
 
     def to_json(self) -> dict[str, Any]:
         if not self.coefficients:
