@@ -100,6 +100,24 @@ def test_a_scan_is_followed_though_its_view_was_left(fresh: Page, console: LiveC
     expect(fresh.locator("#verdict h2")).to_have_text("The scan was cancelled", timeout=LONG_MS)
 
 
+def test_a_scan_that_was_deleted_while_its_view_was_left_is_not_followed(
+    fresh: Page, console: LiveConsole
+) -> None:
+    """The view told of a scan that was being taken until the page was loaded anew."""
+    gone = {"scan_id": "20260101T000000Z-dead", "label": "gone", "state": "capturing",
+            "reasons": [], "framesets": 1, "wanted": 10}  # fmt: skip
+    fresh.route("**/api/v1/scans", lambda route: route.fulfill(json=gone), times=1)
+    log_in(fresh, console)
+    open_view(fresh, console, "scan")
+    fresh.click("#go", timeout=LONG_MS)
+    expect(fresh.locator("#stage h2")).to_have_text("gone", timeout=LONG_MS)
+    open_view(fresh, console, "history")
+    expect(fresh.locator("#search")).to_be_visible(timeout=LONG_MS)
+    open_view(fresh, console, "scan")
+    expect(fresh.locator("#notices")).to_contain_text("This scan was deleted", timeout=LONG_MS)
+    expect(fresh.locator("#go")).to_be_enabled(timeout=LONG_MS)
+
+
 def test_a_person_whose_scan_is_cancelled_is_not_asked_for_another(
     page: Page, console: LiveConsole
 ) -> None:

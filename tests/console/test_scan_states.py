@@ -12,6 +12,7 @@ from station.archive.index import ScanIndex
 from station.console.api import scans
 from station.console.api.problems import ProblemError
 from station.console.api.scans import _state
+from station.console.live.control import NotRunningError
 from station.core.config_file import load_config
 from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
@@ -33,6 +34,9 @@ def test_the_api_tells_of_a_scan_that_was_never_stored_without_a_station(
     )
     scan_id = ScanId("20261125T100000Z-7f3a")
     with pytest.raises(ProblemError, match="there is no scan"):
+        _state(told, scan_id)
+    spool.notes.write(ScanNote(scan_id, "capturing"), durable=False)
+    with pytest.raises(NotRunningError):
         _state(told, scan_id)
     spool.notes.write(ScanNote(scan_id, "failed", reason="the booth was stopped"), durable=False)
     scan = _state(told, scan_id)

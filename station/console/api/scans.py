@@ -121,8 +121,11 @@ def _state(console: Console, scan_id: str) -> Scan:
     except RefusedError as error:
         raise ProblemError(404, "no-such-scan", str(error)) from None
     except NotRunningError:
-        noted = read_noted(console.spool, scan_id_of(scan_id))
+        scan = scan_id_of(scan_id)
+        noted = read_noted(console.spool, scan)
         if noted is None:
+            if console.spool.notes.read(scan) is not None:
+                raise  # it is not over: the station is restarting
             raise ProblemError(404, "no-such-scan", f"there is no scan {scan_id}") from None
         return of_record(console, noted)
     if found.state not in _ON_DISK:

@@ -10,7 +10,6 @@ import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
 const FINAL = ['delivered', 'rescan', 'failed'];
-const STORED = ['accepted', 'reconstructing', 'delivered', 'rescan'];
 const POLL_MS = 1000;
 const TROUBLES_MS = 5000;
 const TOGETHER_MS = 250;
@@ -233,9 +232,10 @@ export async function scan(main, session) {
   // Whether what is told of the last scan was deleted while nothing was heard.
   async function still() {
     const mine = current;
-    if (!mine || !STORED.includes(mine.state)) return;
+    // A countdown is the console's, and a refusal may be: neither needs to be stored.
+    if (!mine || ['countdown', 'failed'].includes(mine.state)) return;
     try { await get(`/scans/${mine.scan_id}`); } catch (error) {
-      if (error.status !== 404 || mine !== current) return;
+      if (error.kind !== 'no-such-scan' || mine !== current || closed) return;
       notice(t('scan.deleted'));
       ready();
     }
