@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
@@ -357,6 +358,23 @@ def test_cameras_without_a_picture_of_the_empty_booth_are_named(tmp_path: Path) 
         (tmp_path / "booth.toml").write_text("".join(map(section.format, names)))
         with pytest.raises(CalibrationError, match=f"no picture of the empty booth by {words}"):
             check_cli._compared(load_config(tmp_path / "booth.toml"), None, quiet=True)
+
+
+@pytest.mark.parametrize(("change", "code"), [(1e-3, 0), (-5e-3, 3)])
+def test_a_check_fails_where_depths_changed_too_much_for_scans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: float, code: int
+) -> None:
+    """It was "no camera has moved", and every scan was refused."""
+    (tmp_path / "booth.toml").write_text(
+        '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+    )
+    still = CameraMove("a", np.zeros(6), 1e-8 * np.eye(6), 1.0)
+    found: Any = {}, ChangedDepths(change, {}, 1e-3), [still]
+    monkeypatch.setattr(check_cli, "_compared", lambda *_, **__: found)
+    options = ["--config", str(tmp_path / "booth.toml"), "--recordings", str(tmp_path)]
+    done = CliRunner().invoke(check_cli.check, options)
+    assert done.exit_code == code, done.output
+    assert ("no camera has moved" in done.output) == (code == 0)
 
 
 def test_cameras_that_were_not_calibrated_are_not_checked(tmp_path: Path) -> None:

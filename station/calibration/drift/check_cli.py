@@ -14,7 +14,7 @@ from station.calibration.drift.depths import ChangedDepths, SeenDepths
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.last_check import keep_check
 from station.calibration.drift.look import Look, compared
-from station.calibration.drift.motion import CameraMove, depths_words, move_words
+from station.calibration.drift.motion import CameraMove, depths_words, everything_words, move_words
 from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
@@ -47,8 +47,9 @@ _EXIT_CHANGED = 4
 def check(config_path: Path | None, recordings: Path | None, as_json: bool, correct: bool) -> None:
     """Compare the empty booth with what was stored when it was calibrated.
 
-    Exit code 0: every camera stands where it did; 3: one has moved, or no longer sees what it saw;
-    4: the booth looks too different to tell, put it in order and check again.
+    Exit code 0: every camera stands where it did; 3: one has moved, or no longer sees what it saw,
+    or all see everything so much nearer or farther away that no scan is taken; 4: the booth looks
+    too different to tell, put it in order and check again.
 
     With --correct: where the scans of the last people say that a camera has drifted, store and use
     a corrected calibration, provided that it also fits people whom it was not computed from.
@@ -68,14 +69,19 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     looks, depths, moves = _compared(config, recordings, quiet=as_json)
     changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
-    words = depths_words(moves) or (depths.words() if depths else "")
+    moved |= depths is not None and depths.too_large
+    words = depths_words(moves)
+    if words is None and depths is not None:
+        # Without the check scans are not corrected either.
+        checked = config.drift.refuse_scans
+        words = depths.words() if checked else everything_words(depths.at_walls)
     if as_json:
         click.echo(json.dumps([_document(move, looks[move.camera].depths) for move in moves]))
     else:
-        _tell(moves, changed, words, moved=moved)
+        _tell(moves, changed, words or "", moved=moved)
     if recordings is None:
         try:
-            keep_check(config.console.folder, moves, words)
+            keep_check(config.console.folder, moves, words or "")
         except OSError as error:
             # What was found is told all the same, by the exit code too.
             reason = error.strerror or str(error)
