@@ -240,6 +240,9 @@ class ScanWriter:
             if look is not None:
                 looks[name] = look
         changed, moves = compared(looks, self._names)
+        self._remarks = []
+        if changed and not changed.too_large:
+            self._remarks = [(rig.created, changed.words())]
         moved = [move for move in moves if self._drift.confirmed(move)]
         for move in moves:
             if move.moved and move not in moved:
@@ -253,7 +256,6 @@ class ScanWriter:
             )
         if changed and changed.too_large:
             raise CalibrationError(changed.words())
-        self._remarks = [(rig.created, changed.words())] if changed else []
         return changed.corrected(rig) if changed else rig
 
     def _failed(self, order: Order, reason: str) -> None:
