@@ -49,6 +49,8 @@ _UNLIKE = 1.5
 Units of one kind change by shares that differ by a factor of two at most."""
 _FEWEST_CAMERAS = 2
 """One camera alone cannot tell whether depths changed or it was pushed back."""
+_OF_UNIT = 0.3
+"""By which share of the change a unit differs from all units, whose own change is not seen."""
 _OF_CHANGE = 0.1
 """Error of the correction as a share of the change: its law may be another one."""
 _SAME_PER_M = 0.01
@@ -199,5 +201,7 @@ def changed_depths(looks: Mapping[str, SeenDepths | None]) -> ChangedDepths | No
         @ at_body
         for name in seen
     ]  # fmt: skip
+    variance = float(at_body @ covariance @ at_body) + (_OF_UNIT * change) ** 2
+    variances += [variance] * (len(looks) - len(seen))
     sigma = np.sqrt(np.mean(variances) + (_OF_CHANGE * change) ** 2)
     return ChangedDepths(at_walls, laws, float(sigma) * BODY_M)
