@@ -25,10 +25,10 @@ from drift_world import (
     direction,
     random_move,
 )
+from moves import move_in
 from numpy.typing import NDArray
 from scipy.stats import beta, chi2
 
-from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.motion import (
     LEVER_M,
     MOVED_M,
@@ -39,7 +39,6 @@ from station.calibration.drift.motion import (
 )
 from station.calibration.drift.reference import DriftReference
 from station.calibration.drift.watch import Doubts
-from station.core.kinect_v1 import DEPTH_SCALE_M
 
 FALSE_ALARMS_BAR, COVERAGE_BAR = 1e-3, 0.95
 SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
@@ -133,13 +132,13 @@ def trials(
         for name, sensor in booth.sensors.items():
             true = draw(rng)
             taken = sensor.frames(visit, true, frames)
-            move, doubts = estimate_move(references[name], taken, DEPTH_SCALE_M), Doubts()
+            move, doubts = move_in(references[name], taken), Doubts()
             named = doubts.confirmed(move)
             if (move.moved or move.lost) and not named:
                 then = booth.scenes[(scan + 1) % len(booth.scenes)]
                 again = booth.visit(then, visit.seed + _AGAIN, visit.day)
                 taken = sensor.frames(again, true, frames)
-                named = doubts.confirmed(estimate_move(references[name], taken, DEPTH_SCALE_M))
+                named = doubts.confirmed(move_in(references[name], taken))
             yield Trial(booth.seed, scan, scene, true, move, named)
 
 
@@ -267,7 +266,7 @@ def _blindness(seed: int) -> None:
         along = np.cross(normal, [0.0, 1.0, 0.0])
         xi = np.concatenate([np.zeros(3), _BLIND_M * along / np.linalg.norm(along)])
         frames = sensor.frames(booth.visit("empty", 0), xi, CHECK_FRAMES)
-        move = estimate_move(reference, frames, DEPTH_SCALE_M)
+        move = move_in(reference, frames)
         unseen = np.array(move.unseen()).reshape(-1, 6)
         blind = np.linalg.norm(unseen[:, 3:] @ (xi[3:] / _BLIND_M)) > 0.95
         print(

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from moves import move_in
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift import check_cli
 from station.calibration.drift.depths import ChangedDepths
-from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.last_check import keep_check, last_check
 from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
 from station.calibration.drift.reference import DriftReference, plane_slopes
@@ -69,7 +69,7 @@ def reference(stored: StaticView) -> DriftReference:
 def test_a_camera_that_stands_still_is_left_alone(
     reference: DriftReference, meshes: tuple[Mesh, ...]
 ) -> None:
-    move = estimate_move(reference, _frames(_view(meshes), 10, seed=2), DEPTH_SCALE_M)
+    move = move_in(reference, _frames(_view(meshes), 10, seed=2))
     assert not move.moved
     assert not move.lost
     assert move.alarm() < 0.9
@@ -91,7 +91,7 @@ def test_a_camera_that_stands_still_is_left_alone(
 )
 def test_moves_are_named_with_a_person_in_view(reference: DriftReference, xi: Twist) -> None:
     view = _view((*ROOM, BODY), xi)
-    move = estimate_move(reference, _frames(view, 10, seed=3), DEPTH_SCALE_M)
+    move = move_in(reference, _frames(view, 10, seed=3))
     assert move.moved
     assert "camera front-lower has moved" in move.words()
     scale = np.array([LEVER_M] * 3 + [1.0] * 3)
@@ -116,14 +116,14 @@ def test_a_chair_that_was_moved_is_no_moved_camera(
     few others show a shift along the wall."""
     x, y = by_m
     frames = _frames(_with_chair(x - 0.8, y + 0.6), 10, seed=12)
-    move = estimate_move(furnished, frames, DEPTH_SCALE_M)
+    move = move_in(furnished, frames)
     assert not move.moved
 
 
 def test_a_moved_camera_is_named_though_a_chair_was_moved(furnished: DriftReference) -> None:
     xi: Twist = (0.0, 0.009, 0.0, 0.0, 0.0, 0.0)
     frames = _frames(_with_chair(-0.77, 0.6, xi), 10, seed=13)
-    move = estimate_move(furnished, frames, DEPTH_SCALE_M)
+    move = move_in(furnished, frames)
     assert move.moved
     off = move.xi - xi
     assert off @ np.linalg.solve(move.covariance, off) < 16.8
@@ -132,18 +132,18 @@ def test_a_moved_camera_is_named_though_a_chair_was_moved(furnished: DriftRefere
 def test_a_hard_knock_is_measured(reference: DriftReference) -> None:
     """Outlines see only a few pixels far: the surfaces have to bring them there."""
     xi = (0.015, -0.02, 0.01, 0.03, -0.01, 0.02)
-    move = estimate_move(reference, _frames(_view(ROOM, xi), 10, seed=4), DEPTH_SCALE_M)
+    move = move_in(reference, _frames(_view(ROOM, xi), 10, seed=4))
     assert move.moved
     assert np.allclose(move.xi[:3], xi[:3], atol=0.003)
     assert np.allclose(move.xi[3:], xi[3:], atol=0.006)
 
 
 def test_a_covered_or_turned_camera_is_lost(reference: DriftReference) -> None:
-    covered = estimate_move(reference, [np.full((480, 640), 8000, np.uint16)] * 3, DEPTH_SCALE_M)
+    covered = move_in(reference, [np.full((480, 640), 8000, np.uint16)] * 3)
     assert covered.lost
     assert "no longer sees" in covered.words()
     turned = _view(ROOM, (0.0, 0.6, 0.0, 0.0, 0.0, 0.0))
-    move = estimate_move(reference, _frames(turned, 5, seed=5), DEPTH_SCALE_M)
+    move = move_in(reference, _frames(turned, 5, seed=5))
     assert move.lost or move.moved
 
 
@@ -154,12 +154,12 @@ def test_a_bare_wall_says_nothing_of_moves_along_it() -> None:
         CAMERA, static_view(_frames(_view(wall), 20, seed=6), DEPTH_SCALE_M)
     )
     along = _view(wall, (0.0, 0.0, 0.0, 0.01, 0.0, 0.0))
-    move = estimate_move(bare, _frames(along, 10, seed=7), DEPTH_SCALE_M)
+    move = move_in(bare, _frames(along, 10, seed=7))
     assert {"shift sideways", "shift up or down", "roll"} <= set(move.unseen_words())
     assert not move.moved
     nearer = _view(wall, (0.0, 0.0, 0.0, 0.0, 0.0, 0.005))
     assert not any("forward" in words for words in move.unseen_words())
-    assert estimate_move(bare, _frames(nearer, 10, seed=8), DEPTH_SCALE_M).moved
+    assert move_in(bare, _frames(nearer, 10, seed=8)).moved
 
 
 def test_an_edge_that_loses_pixels_is_no_moved_camera() -> None:
@@ -170,7 +170,7 @@ def test_an_edge_that_loses_pixels_is_no_moved_camera() -> None:
         CAMERA, static_view(_frames(_view(wall), 45, seed=14), DEPTH_SCALE_M)
     )
     lost = [_without_edges(frame, 2) for frame in _frames(_view(wall), 10, seed=15)]
-    move = estimate_move(bare, lost, DEPTH_SCALE_M)
+    move = move_in(bare, lost)
     assert move.alarm() < 0.6
     assert "shift up or down" in move.unseen_words()
 
@@ -329,7 +329,7 @@ def test_depths_that_changed_are_told_in_front_of_plain_walls() -> None:
         frames = _frames(view, 30, seed=4)
         before = DriftReference.prepare(camera, static_view(frames[:20], DEPTH_SCALE_M))
         nearer = [np.round(0.997 * frame).astype(np.uint16) for frame in frames[20:]]
-        moves.append(estimate_move(before, nearer, DEPTH_SCALE_M))
+        moves.append(move_in(before, nearer))
     assert "nearer than when they were" in str(depths_words(moves))
 
 

@@ -8,13 +8,13 @@ image then says that the camera stands where it did, the thing was moved.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.detect.scene import mean_view, smoothed
+from station.calibration.detect.scene import smoothed
 from station.calibration.drift.alignment import Alignment, align
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import BLOCK, DriftReference
@@ -34,16 +34,13 @@ _SUSPECT = 16.8
 between two estimates, beyond which they contradict each other: once in 100, by chance."""
 
 
-def estimate_move(
-    reference: DriftReference, frames: Sequence[NDArray[np.uint16]], scale_m: float
-) -> CameraMove:
-    """Compare frames (h, w) in units of scale_m, of one moment, with the stored background."""
-    return estimated(reference, *mean_view(frames, scale_m), len(frames))
+def estimate_move(reference: DriftReference, mean: Image, share: Image, frames: int) -> CameraMove:
+    """The camera's move from what so many frames of one moment show in front of the stored
+    background.
 
-
-def estimated(reference: DriftReference, mean: Image, share: Image, frames: int) -> CameraMove:
-    """The camera's move from the mean inverse depth (h, w) of some frames, no reading counting as
-    0, and the share (h, w) of them that have a reading."""
+    Args:
+        mean, share: see `station.calibration.detect.scene.mean_view`.
+    """
     now = smoothed(mean, share)
     whole = align(reference, now, frames)
     if whole.move.lost:

@@ -15,7 +15,7 @@ from station.calibration.drift.depths import (
     changed_depths,
     seen_depths,
 )
-from station.calibration.drift.estimate import estimated
+from station.calibration.drift.estimate import estimate_move
 from station.calibration.drift.motion import CameraMove
 from station.calibration.drift.reference import DriftReference
 from station.core.depth.images import Image
@@ -51,7 +51,7 @@ class Look:
         """The camera's displacement, if its depths have changed by this law."""
         inverse = self.mean / np.maximum(self.share, 1e-6)
         mean = self.mean + self.share * np.polynomial.polynomial.polyval(inverse, law)
-        return estimated(self.reference, np.asarray(mean, np.float32), self.share, self.frames)
+        return estimate_move(self.reference, np.asarray(mean, np.float32), self.share, self.frames)
 
 
 def compared(
