@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from station.booth.collection import LATE, Collection, Order
 from station.calibration.drift.look import Look, compared
-from station.calibration.drift.motion import depths_words
+from station.calibration.drift.motion import CameraMove, depths_words
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
 from station.core.bundle import CapturedFrame, write_bundle
@@ -243,9 +243,11 @@ class ScanWriter:
         self._remarks = []
         if changed and not changed.too_large:
             self._remarks = [(rig.created, changed.words())]
-        moved = [move for move in moves if self._drift.confirmed(move)]
+        moved: list[CameraMove] = []
         for move in moves:
-            if move.moved and move not in moved:
+            if self._drift.confirmed(move):
+                moved.append(move)
+            elif move.moved:
                 self._log.warning("the next scan decides: %s", move.words())
         if len(moved) == len(self._names) and (words := depths_words(moved)):
             raise CalibrationError(words)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from violated_scans import measured
 
 from station.calibration.detect.scene import static_view
 from station.calibration.drift.look import Look, compared
@@ -15,13 +16,8 @@ from station.core.kinect_v1 import DEPTH_SCALE_M, depth_of_raw
 from station.core.rig import PredictedError, Rig
 from station.simulation.scene import load_mesh
 from station.simulation.sensor import SimulatedBooth, VirtualCamera, render_bundle
-from workers.cloud.preprocess import preprocess
-from workers.measure.body import Measurement, measure_body
+from workers.measure.body import Measurement
 from workers.measure.definitions import DEFINITIONS
-from workers.reconstruct.job import scan_errors
-from workers.scape.fit.fit import fit_overlapping
-from workers.scape.fit.observer import unobserved
-from workers.scape.model.blas import single_threaded_blas
 from workers.scape.model.body_model import load_model
 
 BODY = Path(__file__).parents[2] / "station/simulation/bodies/ben.npz"
@@ -29,12 +25,7 @@ GIRTHS = {row.name for row in DEFINITIONS if row.quantity in ("girth", "large gi
 
 
 def _girths(bundle: Bundle, rig: Rig) -> dict[str, Measurement]:
-    scan, model = preprocess(replace(bundle, rig=rig)), load_model()
-    with single_threaded_blas():
-        fit = fit_overlapping(model, scan, "joint", lambda *_: None, unobserved)
-        errors = scan_errors(model, fit, rig.predicted)
-        surface = fit.surface
-        rows = measure_body(model, fit.vertices, surface.sigma_m, surface.seen, errors).rows
+    rows = measured(load_model(), bundle, rig)[0].rows
     return {row.name: row for row in rows if row.name in GIRTHS}
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from room import first_with_room
 from true_measurements import TrueBody
 
-from station.core.bundle import read_bundle
+from station.core.bundle import Bundle, read_bundle
 from station.core.rig import Rig
 from station.simulation.scene import Mesh
 from station.simulation.sensor import SimulatedBooth, render_bundle
@@ -94,15 +94,15 @@ def scan_rows(model: BodyModel, booth: SimulatedBooth, rig: Rig, folder: Path) -
     )
     mesh = on_the_mark(body, database.faces)
     sound = replace(booth, bias_m=0.0, violations=frozenset())
-    measured, status = _measured(model, mesh, booth, rig, folder / "found")
+    found, status = _measured(model, mesh, booth, rig, folder / "found")
     true, _ = _measured(model, mesh, sound, booth.rig, folder / "true")
     truth = TrueBody(model, mesh.vertices).values()
-    names = tuple(row.name for row in measured.rows)
+    names = tuple(row.name for row in found.rows)
     return ScannedRows(
         names,
         np.array([truth[name] for name in names]),
-        np.array([row.value_m for row in measured.rows]),
-        np.array([row.interval95_m for row in measured.rows]),
+        np.array([row.value_m for row in found.rows]),
+        np.array([row.interval95_m for row in found.rows]),
         np.array([row.value_m for row in true.rows]),
         np.array([row.interval95_m for row in true.rows]),
         status,
@@ -116,8 +116,12 @@ def _posed(database: BodyDatabase, shapes: Shapes, poses: Array) -> Iterator[Arr
 def _measured(
     model: BodyModel, body: Mesh, booth: SimulatedBooth, rig: Rig, folder: Path
 ) -> tuple[MeasuredBody, str]:
-    """Measurements and the fit's verdict, as a reconstruction job has them."""
-    scan = preprocess(replace(read_bundle(render_bundle(body, folder, booth)), rig=rig))
+    return measured(model, read_bundle(render_bundle(body, folder, booth)), rig)
+
+
+def measured(model: BodyModel, bundle: Bundle, rig: Rig) -> tuple[MeasuredBody, str]:
+    """Measurements by a calibration and the fit's verdict, as a reconstruction job has them."""
+    scan = preprocess(replace(bundle, rig=rig))
     with single_threaded_blas():
         fit = fit_overlapping(model, scan, "joint", lambda *_: None, unobserved)
         verdict = separate_limbs(model, fit, scan.findings, unobserved).verdict

@@ -26,10 +26,10 @@ from station.core.lens import project
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CORRELATION = 2.5
+_CORRELATION = 2.5
 """Samples after a blur of 3.4 px (the sensor's window and ours) are nearly independent; the
 variances of their sums are this much larger."""
-FLOOR_PER_M = 2e-5
+_FLOOR_PER_M = 2e-5
 """Error that averaging does not remove (quantisation), 1/m; 0.3 mm at 3.7 m."""
 _COMMON_SIGMA = np.array([5e-5, 1e-4, 1.0, 1.0])
 """Standard deviations of `DriftReference.common`: warmth changes the depth of a warm sensor by
@@ -102,6 +102,20 @@ def align(reference: DriftReference, now: tuple[Image, Image], frames: int) -> A
     return Alignment(move, chosen.blocks, information, rest)
 
 
+def sample_sigma(reference: DriftReference, frames: int, *, still: bool) -> Array:
+    """Standard deviations (r, c) of the samples' differences in so many frames, 1/m."""
+    # The frozen share does not average out, and only a camera that moves sees it change.
+    share = 0.0 if still else 2.0 * FROZEN_SHARE
+    share += (1.0 - FROZEN_SHARE) * (1.0 / frames + 1.0 / reference.frames)
+    variance = reference.noise**2 * share + _FLOOR_PER_M**2
+    return np.asarray(np.sqrt(_CORRELATION * variance))
+
+
+def tukey(off: Array) -> Array:
+    """Tukey's weights of deviations in standard deviations."""
+    return np.asarray(np.square(np.maximum(0.0, 1.0 - np.square(off / _TUKEY))))
+
+
 def _unseen_errors(size: float) -> Array:
     """Covariance (6, 6) of errors that no sample shows, of a move of a size (turns times lever)."""
     return np.diag((_SYSTEMATIC_M**2 + (_RELATIVE * size) ** 2) / np.square(_SCALE))
@@ -127,11 +141,7 @@ class _Samples:
         at = np.flatnonzero(same)
         block = reference.block.ravel()[at]
         at, block = at[np.argsort(block, kind="stable")], np.sort(block)
-        # The frozen share does not average out, and a camera that moves sees it change.
-        share = 2.0 * FROZEN_SHARE
-        share += (1.0 - FROZEN_SHARE) * (1.0 / frames + 1.0 / reference.frames)
-        variance = reference.noise.ravel()[at] ** 2 * share + FLOOR_PER_M**2
-        sigma = np.sqrt(CORRELATION * variance)
+        sigma = sample_sigma(reference, frames, still=False).ravel()[at]
         columns = (reference.jacobian, reference.common, reference.local)
         design = np.concatenate([c.reshape(-1, c.shape[-1])[at] for c in columns], axis=1)
         starts = np.flatnonzero(np.diff(block, prepend=-1))
@@ -206,7 +216,7 @@ def _weights(off: Array, convex: bool) -> Array:
     """
     if convex:
         return np.asarray(_HUBER / np.maximum(off, _HUBER))
-    return np.asarray(np.square(np.maximum(0.0, 1.0 - np.square(off / _TUKEY))))
+    return tukey(off)
 
 
 def _changed(reference: DriftReference, now: tuple[Image, Image], xi: Array) -> Mask:

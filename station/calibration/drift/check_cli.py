@@ -70,18 +70,18 @@ def check(config_path: Path | None, recordings: Path | None, as_json: bool, corr
     changed = [move for move in moves if move.changed]
     moved = any(move.moved or move.lost for move in moves)
     moved |= depths is not None and depths.too_large
-    words = depths_words(moves)
-    if words is None and depths is not None:
+    words = depths_words(moves) or ""
+    if not words and depths is not None:
         # Without the check scans are not corrected either.
         checked = config.drift.refuse_scans
         words = depths.words() if checked else everything_words(depths.at_walls)
     if as_json:
         click.echo(json.dumps([_document(move, looks[move.camera].depths) for move in moves]))
     else:
-        _tell(moves, changed, words or "", moved=moved)
+        _tell(moves, changed, words, moved=moved)
     if recordings is None:
         try:
-            keep_check(config.console.folder, moves, words or "")
+            keep_check(config.console.folder, moves, words)
         except OSError as error:
             # What was found is told all the same, by the exit code too.
             reason = error.strerror or str(error)

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, smoothed
 from station.calibration.detect.warmth import BODY_M, common_change, depth_change, where_words
-from station.calibration.drift.alignment import CORRELATION, FLOOR_PER_M
+from station.calibration.drift.alignment import sample_sigma, tukey
 from station.calibration.drift.motion import everything_words
 from station.calibration.drift.reference import DriftReference
 from station.core.depth.images import Image
-from station.core.kinect_v1 import FROZEN_SHARE
 from station.core.rig import Rig
 
 Array = NDArray[np.float64]
@@ -59,7 +58,7 @@ _SHADOW_CELLS = 2
 """... and so may be those around."""
 _READ, _READ_PX = 0.85, 15
 """Share of the readings around a sample that has to be there."""
-_FEWEST, _ROUNDS, _TUKEY = 300, 8, 4.685
+_FEWEST, _ROUNDS = 300, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +135,7 @@ def seen_depths(
     calm &= others == 0
     if calm.sum() < _FEWEST:
         return None
-    share_of_noise = (1.0 - FROZEN_SHARE) * (1.0 / frames + 1.0 / reference.frames)
-    variance = share_of_noise * reference.noise[calm] ** 2 + FLOOR_PER_M**2
-    sigma = np.sqrt(CORRELATION * variance)
+    sigma = sample_sigma(reference, frames, still=True)[calm]
     columns = (-reference.jacobian[calm], np.vander(reference.image[calm], _TERMS, increasing=True))
     design = np.concatenate(columns, axis=1) / sigma[:, None]
     normal, right = _robust(design, off[calm] / sigma)
@@ -158,7 +155,7 @@ def _robust(design: Array, off: Array) -> tuple[Array, Array]:
         normal, right = design.T @ (design * weights[:, None]), design.T @ (weights * off)
         rest = np.abs(off - design @ np.linalg.lstsq(normal + still, right)[0])
         size = max(1.0, 1.4826 * float(np.median(rest)))
-        weights = np.square(np.maximum(0.0, 1.0 - np.square(rest / (_TUKEY * size)))) / size**2
+        weights = tukey(rest / size) / size**2
     return normal, right
 
 
