@@ -35,7 +35,8 @@ _MIN_SLOPE = 1e-6
 class _View:
     camera: CameraView
     inside_px: Image
-    """(h, w): distance to the nearest pixel that is not background; 0 elsewhere."""
+    """(h, w): distance to the nearest pixel that is not background, or is beyond the image; 0
+    where no background is."""
     slope: tuple[Image, Image]
     """Derivatives of `inside_px` along u and v."""
 
@@ -92,14 +93,16 @@ class FreeSpace:
 
 
 def _view(view: CameraView) -> _View:
-    inside = cv2.distanceTransform(view.background.astype(np.uint8), cv2.DIST_L2, 3)
-    slope_u = cv2.Sobel(inside, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    slope_v = cv2.Sobel(inside, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
-    return _View(
-        view,
-        inside.astype(np.float32, copy=False),
-        (slope_u.astype(np.float32, copy=False), slope_v.astype(np.float32, copy=False)),
+    # What is beyond the image is unknown, thus not background: of an arm at the image's border the
+    # next pixel that shows it can be a decimetre along the border.
+    background = np.pad(view.background, 1).astype(np.uint8)
+    distance = cv2.distanceTransform(background, cv2.DIST_L2, 3)
+    slope_u = cv2.Sobel(distance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    slope_v = cv2.Sobel(distance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    inside, *slope = (
+        image[1:-1, 1:-1].astype(np.float32, copy=False) for image in (distance, slope_u, slope_v)
     )
+    return _View(view, inside, (slope[0], slope[1]))
 
 
 def _before_background(
