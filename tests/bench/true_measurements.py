@@ -18,9 +18,11 @@ from workers.measure.kinds import (
     NARROWEST_TILTS_RAD,
     NORMAL_RADIUS,
     PROTRUSION_SHARE,
+    SHORTEST_TILTS_RAD,
     TRUNK_ENDS,
     Definition,
     Drop,
+    Leg,
     Level,
     Narrowest,
     Perpendicular,
@@ -40,6 +42,7 @@ _STEP_M = 2.5e-4
 _LEVEL_STEP_M = 2e-3
 _SAME_POINT_M = 1e-6
 _BELOW = 0.10
+_SHORTEST_TILTS = 21
 
 
 class TrueBody:
@@ -175,16 +178,24 @@ class TrueBody:
             elif leg == "straight":
                 total += float(np.linalg.norm(self._at[names[index + 1]] - self._at[names[index]]))
             else:
-                total += self._over(kind, names[index], names[index + 1], leg == "tape")
+                total += self._over(kind, names[index], names[index + 1], leg)
         return total
 
-    def _over(self, kind: Route, start: str, end: str, taut: bool) -> float:
+    def _over(self, kind: Route, start: str, end: str, leg: Leg) -> float:
         a, b = self._at[start], self._at[end]
         if kind.closed:
             middle = sum(self._at[name] for name in kind.landmarks) / len(kind.landmarks)
             outward = (a + b) / 2.0 - middle
         else:
             outward = self._normal(start, kind.parts) + self._normal(end, kind.parts)
+        if leg != "shortest":
+            return self._in_plane(kind, a, b, outward, leg == "tape")
+        along = (b - a) / np.sqrt((b - a) @ (b - a))
+        tilts = np.linspace(SHORTEST_TILTS_RAD[0], SHORTEST_TILTS_RAD[-1], _SHORTEST_TILTS)
+        turned = (so3_exp(tilt * along) @ outward for tilt in tilts)
+        return min(self._in_plane(kind, a, b, outward, False) for outward in turned)
+
+    def _in_plane(self, kind: Route, a: Array, b: Array, outward: Array, taut: bool) -> float:
         length = float(np.linalg.norm(b - a))
         along = (b - a) / length
         up = outward - along * (along @ outward)

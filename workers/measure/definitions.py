@@ -62,7 +62,7 @@ def _heights() -> tuple[Definition, ...]:
 
 _NECK_FOOT = Route(
     ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-    ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25,
+    ("shortest", "shortest", "shortest", "shortest"), SHOULDERS, closed=True,
 )  # fmt: skip
 
 

@@ -14,17 +14,22 @@ Quantity = Literal[
 ]
 """Quantity that a row measures; ISO 20685-1 sets its limits by quantity."""
 
-Leg = Literal["skin", "tape", "straight", "floor"]
-"""Leg of a route: along the skin; along the skin but taut over hollows, as a tape; straight through
-the air; straight down to the floor, which ends the route.
+Leg = Literal["skin", "tape", "shortest", "straight", "floor"]
+"""Leg of a route: along the skin; along the skin but taut over hollows, as a tape; along the skin
+where it is shortest; straight through the air; straight down to the floor, which ends the route.
 
 Skin and tape run in the plane of both ends and a direction outwards, on the side of that direction.
 It is the one from the middle of all landmarks to the middle of both ends where the route is closed;
 else the sum of both ends' normals, each the mean over the skin of the route's parts, with weights
-1 - (d / r)^2 at the distance d from the end, r being `NORMAL_RADIUS` of the trunk's length. Points
-of the section that are farther from the straight line than 0.1 of its length below it, or
+1 - (d / r)^2 at the distance d from the end, r being `NORMAL_RADIUS` of the trunk's length. The
+shortest leg is the shortest of those along the skin whose direction outwards is turned about the
+straight line by `SHORTEST_TILTS_RAD`, to where the route's landmarks follow each other clockwise.
+Points of the section that are farther from the straight line than 0.1 of its length below it, or
 `Route.bulge` above it, belong to another part of the body. Where the skin folds back, the line
 follows its outside."""
+SHORTEST_TILTS_RAD = tuple(math.radians(degrees) for degrees in range(5, 46, 5))
+"""Around a neck's foot the shortest planes are tilted up by 5 to 40 degrees. Those of other tilts
+graze shoulders or neck, and follow them far."""
 TRUNK_ENDS = ("cervicale", "crotch")
 NORMAL_RADIUS = 0.11
 """7 cm on an average trunk. Folds of an armpit turn the normals at a landmark itself by 90 degrees:
@@ -111,8 +116,9 @@ class Narrowest:
 
     Of a section in several pieces, the one around the middle of `front` and `back` counts. The
     tilts are `NARROWEST_TILTS_RAD`, to the front where `side` is the right one of the two.
-    A section longer than `foot` takes in shoulders or chin and does not count. Where the first or
-    the last tilt is the best, or none goes around, the body has no such line.
+    A section longer than `NARROWEST_OF_FOOT` times `foot` takes in shoulders or chin and does not
+    count. Where the first or the last tilt is the best, or none goes around, the body has no such
+    line.
     """
 
     front: str
@@ -150,6 +156,8 @@ THICKEST_LEVELS = 9
 NARROWEST_TILTS_RAD = tuple(math.radians(degrees) for degrees in range(-12, 73, 4))
 """Angles between a horizontal plane and those that `Narrowest` tries: necks lean by 19 degrees, by
 55 with a trunk that leans and a head that is bowed."""
+NARROWEST_OF_FOOT = 1.1
+"""Necks of 113 simulated bodies are 0.84 to 1.04 times as long around as their foot."""
 PROTRUSION_SHARE = 0.05
 """13 mm at the belly and 8 at the seat. With it the girth of the belly errs by 3.4 mm on sculpted
 bodies, with the farthest vertex alone by 15."""

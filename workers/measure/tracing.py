@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 from station.core.errors import InputError
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import (
+    NARROWEST_OF_FOOT,
     NARROWEST_TILTS_RAD,
     NORMAL_RADIUS,
     PROTRUSION_SHARE,
+    SHORTEST_TILTS_RAD,
     THICKEST_LEVELS,
     TRUNK_ENDS,
     Definition,
     Drop,
+    Leg,
     Level,
     Narrowest,
     Perpendicular,
@@ -215,7 +218,7 @@ class _Tracer:
         front = self._at(plane.front)
         middle = 0.5 * (front + self._at(plane.back))
         net = _net(self._model, section.parts)
-        most_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
+        foot_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
         tapes: list[tuple[float, float, Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
@@ -223,7 +226,7 @@ class _Tracer:
             places = found.on(self._vertices)
             for tape in tapes_around(found, places, net.pieces(crossing), normal, middle):
                 girth_m = loop_length(tape.places, closed=True)
-                if girth_m < most_m:
+                if girth_m < NARROWEST_OF_FOOT * foot_m:
                     tapes.append((girth_m, tilt, tape))
         if not tapes:
             raise NoLineError("no section goes around it alone")
@@ -289,18 +292,37 @@ class _Tracer:
         ends = marks[1:] + (marks[:1] if route.closed else [])
         for start, end, leg in zip(marks, ends, route.legs, strict=False):
             if leg != "straight":
-                pieces.append(self._over_skin(route, start, end, taut=leg == "tape"))
+                pieces.append(self._over_skin(route, start, end, leg))
             pieces.append(EdgePoints.at([end]))
         if route.closed:
             pieces.pop()
         return EdgePoints.joined(pieces)
 
-    def _over_skin(self, route: Route, start: int, end: int, *, taut: bool) -> EdgePoints:
+    def _over_skin(self, route: Route, start: int, end: int, leg: Leg) -> EdgePoints:
         ends = self._vertices[start], self._vertices[end]
         if route.closed:
             outward = 0.5 * (ends[0] + ends[1]) - self._mean(route.landmarks)
         else:
             outward = self._facing(route, ends[0]) + self._facing(route, ends[1])
+        if leg != "shortest":
+            return self._in_plane(route, ends, outward, taut=leg == "tape")
+        along = ends[1] - ends[0]
+        aside = _unit(cross(along, outward))
+        outward = _unit(cross(aside, along))
+        lines = [
+            self._in_plane(route, ends, np.cos(tilt) * outward + np.sin(tilt) * aside, taut=False)
+            for tilt in SHORTEST_TILTS_RAD
+        ]
+
+        def length_m(line: EdgePoints) -> float:
+            path = np.vstack([ends[0], line.on(self._vertices), ends[1]])
+            return loop_length(path, closed=False)
+
+        return min(lines, key=length_m)
+
+    def _in_plane(
+        self, route: Route, ends: tuple[Array, Array], outward: Array, *, taut: bool
+    ) -> EdgePoints:
         normal = _unit(cross(ends[1] - ends[0], outward))
         net = _net(self._model, route.parts)
         found, crossing = net.cut(self._vertices, ends[0], normal)

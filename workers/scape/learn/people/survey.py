@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import Definition, Level, Route, Section, Tilted
-from workers.measure.vocabulary import TRUNK
+from workers.measure.vocabulary import SHOULDERS, TRUNK
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,7 @@ def _height(name: str, landmark: str) -> Definition:
 
 
 _NECK_SIDES = ("side_neck_right", "side_neck_left")
+_NECK_FOOT = ("cervicale", "side_neck_left", "suprasternale", "side_neck_right")
 _HEAD_PLANE = Tilted("glabella", "occiput", *_NECK_SIDES)
 COMPARISONS: tuple[Comparison, ...] = (
     Comparison(_row("height"), ("stature",)),
@@ -93,7 +94,13 @@ COMPARISONS: tuple[Comparison, ...] = (
     ),
     Comparison(_row("neck_girth"), ("neckcircumference",)),
     Comparison(
-        _row("neck_base_girth"), ("neckcircumferencebase",), (0.010, 0.0),
+        # By this tape, not by the shorter one of `neck_base_girth`, the training bodies are drawn.
+        Definition(
+            "neck_foot_girth", "taut over four landmarks, each leg in a level direction outwards",
+            "girth",
+            Route(_NECK_FOOT, ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25),
+        ),
+        ("neckcircumferencebase",), (0.010, 0.0),
         "a chain lies there; a tape over four landmarks here",
     ),
     Comparison(_row("chest_girth"), ("chestcircumference",)),
