@@ -18,6 +18,7 @@ from workers.scape.evidence.crown import crown_sigma_m
 from workers.scape.evidence.rims import rims_of
 from workers.scape.fit.annealing import COARSE, FINE, MIDDLE
 from workers.scape.fit.hands import place_hands
+from workers.scape.fit.head import settle_head
 from workers.scape.fit.initial import is_head_hidden, starting_states, taller
 from workers.scape.fit.joint import JointResult, fit_jointly
 from workers.scape.fit.normal_equations import Target, even_subset
@@ -324,6 +325,8 @@ def _best_start(
             observer,
         )
         done += len(schedule)
+        if schedule is MIDDLE:
+            best = settle_head(model, sampling, target, best, observer)
     return best
 
 
