@@ -9,6 +9,7 @@ from true_measurements import TrueBody
 
 from station.core.geometry import so3_exp
 from station.core.words.terms import TERMS
+from workers.measure import tracing
 from workers.measure.body import measure_body
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.differences import side_differences
@@ -84,22 +85,34 @@ def test_a_neck_is_as_wide_however_the_head_is_held(
     assert _values(model, model.vertices(bowed))["neck_girth"] == pytest.approx(upright, abs=0.020)
 
 
-@pytest.mark.parametrize("seed", [8, 10])
-def test_a_collar_does_not_jump_with_small_errors_of_the_skin(model: BodyModel, seed: int) -> None:
-    # A plane that grazes the shoulder follows it far, or leaves it: 16 and 23 mm here.
+def test_a_collar_changes_little_with_the_skins_errors(model: BodyModel) -> None:
+    """With a plane that grazes the shoulder, follows it far or leaves it: 9 and 23 mm."""
     row = [one for one in DEFINITIONS if one.name == "neck_base_girth"]
-    _, body = random_body(model, seed, 8.0)
-    usual = trace_all(model, body, row)[0].value_m
-    normals = vertex_normals(body, model.faces)
-    for seen in range(6):
-        rng = np.random.default_rng(seen)
-        waves = rng.standard_normal((4, 3))
-        waves *= 2.0 * np.pi / 0.1 / np.linalg.norm(waves, axis=1)[:, None]
-        phase = rng.uniform(0.0, 2.0 * np.pi, 4)
-        # 2 mm rms, 10 cm long.
-        off = 0.002 * np.cos(body @ waves.T + phase).sum(axis=1) / np.sqrt(2.0)
-        found = trace_all(model, body + off[:, None] * normals, row)[0].value_m
-        assert abs(found - usual) < 0.007
+    moved = []
+    for seed in range(12):
+        _, body = random_body(model, seed, 8.0)
+        normals = vertex_normals(body, model.faces)
+        rng = np.random.default_rng(seed)
+        off = []
+        for _ in range(4):
+            waves = rng.standard_normal((4, 3))
+            waves *= 2.0 * np.pi / 0.1 / np.linalg.norm(waves, axis=1)[:, None]
+            phase = rng.uniform(0.0, 2.0 * np.pi, 4)
+            # 2 mm rms, 10 cm long.
+            skin = 0.002 * np.cos(body @ waves.T + phase).sum(axis=1) / np.sqrt(2.0)
+            off.append(trace_all(model, body + skin[:, None] * normals, row)[0].value_m)
+        moved.append(np.abs(np.array(off) - trace_all(model, body, row)[0].value_m).max())
+    assert np.median(moved) < 0.0065
+    assert max(moved) < 0.012
+
+
+def test_a_section_much_longer_than_the_necks_foot_is_no_neck(
+    model: BodyModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = [one for one in DEFINITIONS if one.name == "neck_girth"]
+    assert np.isfinite(trace_all(model, model.mean, row)[0].value_m)
+    monkeypatch.setattr(tracing, "NARROWEST_OF_FOOT", 0.5)
+    assert np.isnan(trace_all(model, model.mean, row)[0].value_m)
 
 
 def test_hips_are_measured_where_the_seat_is(model: BodyModel) -> None:

@@ -62,7 +62,7 @@ def _heights() -> tuple[Definition, ...]:
 
 _NECK_FOOT = Route(
     ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-    ("shortest", "shortest", "shortest", "shortest"), SHOULDERS, closed=True,
+    ("shortest", "shortest", "shortest", "shortest"), ("head", *SHOULDERS), closed=True,
 )  # fmt: skip
 
 

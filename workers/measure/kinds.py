@@ -22,14 +22,15 @@ Skin and tape run in the plane of both ends and a direction outwards, on the sid
 It is the one from the middle of all landmarks to the middle of both ends where the route is closed;
 else the sum of both ends' normals, each the mean over the skin of the route's parts, with weights
 1 - (d / r)^2 at the distance d from the end, r being `NORMAL_RADIUS` of the trunk's length. The
-shortest leg is the shortest of those along the skin whose direction outwards is turned about the
-straight line by `SHORTEST_TILTS_RAD`, to where the route's landmarks follow each other clockwise.
+shortest leg, of closed routes only, is the shortest of those along the skin whose direction
+outwards is tilted about the straight line by `SHORTEST_TILTS_RAD`, towards where the landmarks are
+seen to follow each other clockwise.
 Points of the section that are farther from the straight line than 0.1 of its length below it, or
 `Route.bulge` above it, belong to another part of the body. Where the skin folds back, the line
 follows its outside."""
 SHORTEST_TILTS_RAD = tuple(math.radians(degrees) for degrees in range(5, 46, 5))
-"""Around a neck's foot the shortest planes are tilted up by 5 to 40 degrees. Those of other tilts
-graze shoulders or neck, and follow them far."""
+"""Around a neck's foot most lines are shortest in between. Planes of other tilts graze shoulders or
+neck: with wider ranges the girth errs by as much or more."""
 TRUNK_ENDS = ("cervicale", "crotch")
 NORMAL_RADIUS = 0.11
 """7 cm on an average trunk. Folds of an armpit turn the normals at a landmark itself by 90 degrees:

@@ -35,8 +35,7 @@ _MIN_SLOPE = 1e-6
 class _View:
     camera: CameraView
     inside_px: Image
-    """(h, w): distance to the nearest pixel that is not background, or is beyond the image; 0
-    where no background is."""
+    """(h, w): distance to the nearest pixel that is not background; 0 elsewhere."""
     slope: tuple[Image, Image]
     """Derivatives of `inside_px` along u and v."""
 
@@ -93,16 +92,14 @@ class FreeSpace:
 
 
 def _view(view: CameraView) -> _View:
-    # What is beyond the image is unknown, thus not background: of an arm at the image's border the
-    # next pixel that shows it can be a decimetre along the border.
-    background = np.pad(view.background, 1).astype(np.uint8)
-    distance = cv2.distanceTransform(background, cv2.DIST_L2, 3)
-    slope_u = cv2.Sobel(distance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
-    slope_v = cv2.Sobel(distance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
-    inside, *slope = (
-        image[1:-1, 1:-1].astype(np.float32, copy=False) for image in (distance, slope_u, slope_v)
+    inside = cv2.distanceTransform(view.background.astype(np.uint8), cv2.DIST_L2, 3)
+    slope_u = cv2.Sobel(inside, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    slope_v = cv2.Sobel(inside, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    return _View(
+        view,
+        inside.astype(np.float32, copy=False),
+        (slope_u.astype(np.float32, copy=False), slope_v.astype(np.float32, copy=False)),
     )
-    return _View(view, inside, (slope[0], slope[1]))
 
 
 def _before_background(
@@ -124,7 +121,10 @@ def _before_background(
 
 def _intrusions(view: _View, pose: Array, vertices: Array) -> Intrusions:
     vertex, pixels, deep, depth_m = _before_background(view, pose, vertices)
-    wrong = (deep > _MARGIN_PX) & (deep < _DEEPEST_PX)
+    # What is beyond the image is unknown. Of an arm of which the border shows nothing, the nearest
+    # pixel that is not background can be a decimetre along the border.
+    beyond = np.minimum(pixels + 1, np.array(view.inside_px.shape[::-1]) - pixels).min(axis=1)
+    wrong = (deep > _MARGIN_PX) & (deep < _DEEPEST_PX) & (deep <= beyond)
     vertex, (u, v), deep, depth_m = vertex[wrong], pixels[wrong].T, deep[wrong], depth_m[wrong]
     slope = np.stack([view.slope[0][v, u], view.slope[1][v, u]], axis=1).astype(np.float64)
     slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), _MIN_SLOPE)

@@ -88,7 +88,7 @@ class FitResult:
     coverage: float
     correspondences: int
     iterations: int
-    """Steps from the starting pose that was chosen."""
+    """Steps from the starting pose that was chosen, without those of a second look at the head."""
     camera_shifts_m: dict[str, float]
     """Distance by which each camera's points were moved to agree with the others."""
     seconds: dict[str, float] = field(default_factory=dict)
