@@ -18,7 +18,17 @@ from workers.measure.kinds import (
     Top,
 )
 from workers.measure.limbs import arm, bodice, hand, leg, shoulder
-from workers.measure.vocabulary import BODY, CLOTHES, COLLAR, HIPS, SHOULDERS, TRUNK, YOKE, distance
+from workers.measure.vocabulary import (
+    BODY,
+    CLOTHES,
+    COLLAR,
+    HIPS,
+    NECK_FOOT,
+    SHOULDERS,
+    TRUNK,
+    YOKE,
+    distance,
+)
 
 _BUST = ("bust_left", "bust_right")
 _UNDERBUST = ("underbust_left", "underbust_right")
@@ -60,12 +70,6 @@ def _heights() -> tuple[Definition, ...]:
     )  # fmt: skip
 
 
-_NECK_FOOT = Route(
-    ("cervicale", "side_neck_left", "suprasternale", "side_neck_right"),
-    ("shortest", "shortest", "shortest", "shortest"), ("head", *SHOULDERS), closed=True,
-)  # fmt: skip
-
-
 def _head_and_neck() -> tuple[Definition, ...]:
     return (
         Definition(
@@ -76,7 +80,7 @@ def _head_and_neck() -> tuple[Definition, ...]:
         Definition(
             "neck_girth", "just below the larynx, perpendicular to the neck", "girth",
             Section(
-                Narrowest("neck_front", "neck_back", *_both("side_neck"), _NECK_FOOT),
+                Narrowest("neck_front", "neck_back", *_both("side_neck"), NECK_FOOT),
                 ("head", *SHOULDERS),
             ),
             f"{CLOTHES} 5.3.2",
@@ -85,7 +89,10 @@ def _head_and_neck() -> tuple[Definition, ...]:
             "neck_base_girth",
             "seventh neck vertebra, side of the neck, pit of the neck and around, over the skin",
             "girth",
-            _NECK_FOOT,
+            Route(
+                NECK_FOOT, ("shortest", "shortest", "shortest", "shortest"),
+                ("head", *SHOULDERS), closed=True,
+            ),
             f"{CLOTHES} 5.3.3",
         ),
     )  # fmt: skip

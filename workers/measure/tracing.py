@@ -132,7 +132,6 @@ class _Tracer:
         self._middles = corners.mean(axis=1)
         self._area_vectors = area_vectors(vertices, model.faces)
         self._cuts: dict[Section, Tape] = {}
-        self._lines: dict[Route, EdgePoints] = {}
         self.missed: list[str] = []
         """Rows whose planes missed what they should cut, and why."""
 
@@ -219,7 +218,7 @@ class _Tracer:
         front = self._at(plane.front)
         middle = 0.5 * (front + self._at(plane.back))
         net = _net(self._model, section.parts)
-        foot_m = loop_length(self._route(plane.foot).on(self._vertices), closed=True)
+        foot_m = loop_length(np.stack([self._at(name) for name in plane.foot]), closed=True)
         tapes: list[tuple[float, float, Tape]] = []
         for tilt in NARROWEST_TILTS_RAD:
             normal = np.cos(tilt) * up + np.sin(tilt) * ahead
@@ -288,12 +287,6 @@ class _Tracer:
         return float(reach[high] - reach[low]), ends, False
 
     def _route(self, route: Route) -> EdgePoints:
-        """Line of a route; kept, since a neck's girth needs that of its foot."""
-        if route not in self._lines:
-            self._lines[route] = self._line(route)
-        return self._lines[route]
-
-    def _line(self, route: Route) -> EdgePoints:
         marks = [self._model.landmarks[name] for name in route.landmarks]
         pieces: list[EdgePoints] = [EdgePoints.at(marks[:1])]
         ends = marks[1:] + (marks[:1] if route.closed else [])

@@ -15,6 +15,8 @@ HIPS = (*TRUNK, "thigh_left", "thigh_right")
 COLLAR = ("shoulder_left", "shoulder_right")
 """Parts between the neck and the arms, without upper arms, which may be raised above them."""
 SHOULDERS = ("neck", "chest", *COLLAR, "upper_arm_left", "upper_arm_right")
+NECK_FOOT = ("cervicale", "side_neck_left", "suprasternale", "side_neck_right")
+"""Landmarks around the foot of the neck, clockwise from above."""
 YOKE = tuple(part for part in SHOULDERS if part != "neck")
 """Parts below the seventh neck vertebra, without a neck that may lean to one side."""
 FLANK = (*HIPS, "shin_left", "shin_right")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from workers.measure.definitions import DEFINITIONS
 from workers.measure.kinds import Definition, Level, Route, Section, Tilted
-from workers.measure.vocabulary import SHOULDERS, TRUNK
+from workers.measure.vocabulary import NECK_FOOT, SHOULDERS, TRUNK
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,6 @@ def _height(name: str, landmark: str) -> Definition:
 
 
 _NECK_SIDES = ("side_neck_right", "side_neck_left")
-_NECK_FOOT = ("cervicale", "side_neck_left", "suprasternale", "side_neck_right")
 _HEAD_PLANE = Tilted("glabella", "occiput", *_NECK_SIDES)
 COMPARISONS: tuple[Comparison, ...] = (
     Comparison(_row("height"), ("stature",)),
@@ -98,7 +97,7 @@ COMPARISONS: tuple[Comparison, ...] = (
         Definition(
             "neck_foot_girth", "taut over four landmarks, each leg in a level direction outwards",
             "girth",
-            Route(_NECK_FOOT, ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25),
+            Route(NECK_FOOT, ("tape", "tape", "tape", "tape"), SHOULDERS, closed=True, bulge=0.25),
         ),
         ("neckcircumferencebase",), (0.010, 0.0),
         "a chain lies there; a tape over four landmarks here",
