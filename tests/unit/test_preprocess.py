@@ -178,6 +178,15 @@ def test_noise_that_stays_from_frame_to_frame_is_noticed(tmp_path: Path) -> None
     assert noise_m[FROZEN,] == pytest.approx(2.6e-3, rel=0.15)
 
 
+def test_the_filter_hardly_bends_skin_at_the_border_of_an_image() -> None:
+    # Skin that tilts away by 3 mm a pixel; with a mirror at the border 3.1 and 0.9 mm.
+    whole = np.tile(1.7 + 0.003 * np.arange(80, dtype=np.float32), (60, 1))
+    off_m = np.abs(filtered(whole[:, 20:], 1.7) - filtered(whole, 1.7)[:, 20:])[10:-10]
+    assert off_m[:, 0].max() < 0.0017
+    assert off_m[:, 1].max() < 0.0005
+    assert off_m[:, 3:].max() < 1e-5
+
+
 def test_the_filter_is_wider_before_a_noisy_sensor() -> None:
     noise = np.random.default_rng(2).standard_normal((60, 60))
     depth_m = (1.7 + 4e-3 * noise).astype(np.float32)

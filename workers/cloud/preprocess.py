@@ -193,8 +193,8 @@ def filtered(depth_m: Image, typical_m: float, noise: float = 1.0) -> Image:
         1 + 2 * int(np.ceil(_BILATERAL_RADII * space_px)),
         _BILATERAL_RANGE_SIGMAS * float(random_sigma_m(np.array(typical_m))),
         space_px,
-        # As far away as a gap: mirrored skin tilted that at the border by 5 degrees.
-        borderType=cv2.BORDER_CONSTANT,
+        # Of skin that tilts away the outermost reading is off by half as much as with a mirror.
+        borderType=cv2.BORDER_REPLICATE,
     )
     smooth[depth_m == 0.0] = 0.0
     return np.asarray(smooth, np.float32)
