@@ -90,7 +90,7 @@ def head_off_m(
 def _paired(
     model: BodyModel, target: Target, points: NDArray[np.intp], vertices: Array
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which of some points have skin of head or neck near them, and its nearest vertex."""
+    """Those of some points that have skin of head or neck near them, and its nearest vertex."""
     neck = model.part_of_vertex == model.part_names.index("neck")
     near = np.flatnonzero(_on_head(model) | neck)
     skin = OrientedTree.build(vertices[near], vertex_normals(vertices, model.faces)[near])
