@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.kinect_v1 import NO_READING
+from station.simulation.interference import Interference
 from station.simulation.violations import SmoothBias, ZeroPlane
 
-BASELINE_M = 0.075
 _WINDOW_PX = 9
 _FADE_START_RAD, _FADE_END_RAD = np.radians(66.0), np.radians(76.0)
 _STEEP_RAD = np.radians(60.0)
@@ -57,6 +57,8 @@ class TrueView:
     """Mask of the pixels that the projector's light reaches."""
     reflects: NDArray[np.bool_]
     """False on dark hair or underwear, which give no reading."""
+    foreign: Image | None = None
+    """Light of other sensors' projectors, in shares of the sensor's own; None for none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +92,7 @@ class UnitError:
     """Share of the noise's variance that is the same in every frame ..."""
     frozen_seed: tuple[int, ...] = ()
     """... and which pattern it is."""
+    interference: Interference | None = None
 
     def apply(self, depth_m: Image, window: Window | None = None) -> Image:
         """The depths that the unit reports; of a part of the image where a window is given."""
@@ -143,6 +146,7 @@ class NoiselessView:
     unit: UnitError
     frozen: Image | None
     """The part of the noise that stays, of unit variance."""
+    foreign: Image | None
 
     @classmethod
     def of(cls, view: TrueView, unit: UnitError, window: Window | None = None) -> NoiselessView:
@@ -154,13 +158,18 @@ class NoiselessView:
             pattern = _frozen_pattern(unit.frozen_seed, whole.image_height, whole.image_width)
             height, width = depth.shape
             frozen = pattern[whole.top : whole.top + height, whole.left : whole.left + width]
+        sigma_m = axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD))
+        foreign = None if unit.interference is None else view.foreign
+        if unit.interference is not None and foreign is not None:
+            sigma_m = sigma_m * np.sqrt(1.0 + unit.interference.noise * foreign)
         return cls(
             depth_m=depth,
             seen=(depth > 0) & view.lit & view.reflects,
-            sigma_m=axial_sigma_m(depth, np.minimum(view.incidence_rad, _FADE_END_RAD)),
+            sigma_m=sigma_m,
             fade=(view.incidence_rad - _FADE_START_RAD) / (_FADE_END_RAD - _FADE_START_RAD),
             unit=unit,
             frozen=frozen,
+            foreign=foreign,
         )
 
     def read(self, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -170,6 +179,11 @@ class NoiselessView:
             share = self.unit.frozen_share
             noise = np.sqrt(1.0 - share) * noise + np.sqrt(share) * self.frozen
         measured = np.where(self.seen, self.depth_m + self.sigma_m * noise, 0.0).astype(np.float32)
+        if self.unit.interference is not None and self.foreign is not None:
+            lost, wrong = self.unit.interference.failing(self.foreign, rng)
+            measured[lost] = 0.0
+            taken = wrong & self.seen
+            measured[taken] = self.unit.interference.wrong_m(self.depth_m)[taken]
         measured[rng.random(self.depth_m.shape, dtype=np.float32) < self.fade] = 0.0
         return raw_from_depth(_flying(measured, rng), self.unit.zero_plane)
 

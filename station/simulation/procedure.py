@@ -104,7 +104,7 @@ class VirtualProcedure:
         calibration = unit.camera
         index = list(self.booth.rig.cameras).index(camera)
         rng = np.random.default_rng((self.booth.seed, index, 2, self.steps.index(step)))
-        view = self._still(camera, self._board_y_m(step))
+        view, others = self._still(camera, self._board_y_m(step)), self.booth.disturbing(camera)
         # The background is a short loop with noise; only moving objects are drawn in each frame.
         moves = step in (BALL, MARK, FRONT) or step.startswith(PLACES)
         still = NoiselessView.of(view, unit.error)
@@ -116,7 +116,7 @@ class VirtualProcedure:
         for sequence in (first + int(later) for later in np.arange(0.0, count, stride)):
             time_s = unit.phase_s + sequence / FRAME_RATE_HZ
             raw = loop[int(rng.integers(len(loop)))] if moves else still.read(rng)
-            drawn = overlay(view, calibration, self._moving(step, time_s))
+            drawn = overlay(view, calibration, self._moving(step, time_s), others)
             if drawn is not None:
                 part, window = drawn
                 height, width = part.depth_m.shape
@@ -151,7 +151,9 @@ class VirtualProcedure:
                 rng = np.random.default_rng((self.booth.seed, 8))
                 meshes.append(uneven(board, 1, self.booth.uneven_board_m, rng))
             calibration = SimulatedUnit.of(self.booth, camera).camera
-            view = VirtualScene(meshes).view(calibration, calibration.world_from_camera)
+            view = VirtualScene(meshes).view(
+                calibration, calibration.world_from_camera, self.booth.disturbing(camera)
+            )
             self._views[camera, board_y_m] = view
         return self._views[camera, board_y_m]
 

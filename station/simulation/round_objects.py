@@ -6,7 +6,8 @@ cast once, and balls and capsules (rods with round ends) are overlaid in closed 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -15,11 +16,15 @@ from numpy.typing import NDArray
 from station.core.geometry import invert, transform
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
-from station.simulation.noise import BASELINE_M, TrueView, Window
+from station.simulation.interference import BASELINE_M, Projector, in_shares
+from station.simulation.noise import Image, TrueView, Window
 
 Array = NDArray[np.float64]
 
 _SHADOW_TOLERANCE_M = 1e-4
+_SMALLEST = 1e-12
+_FEWEST = 2
+"""Rows and columns that show a slope."""
 _MARGIN_PX = 14
 """Margin around moving objects that is redrawn, since their edges flicker."""
 
@@ -45,12 +50,15 @@ def ball(
 
 
 def overlay(
-    still: TrueView, camera: CameraCalibration, capsules: list[Capsule]
+    still: TrueView,
+    camera: CameraCalibration,
+    capsules: list[Capsule],
+    others: Collection[Projector] = (),
 ) -> tuple[TrueView, Window] | None:
     """The part of a view that capsules change, drawn with them; None where they are out of sight.
 
     ``still`` is the whole view without them. Their shadows in the projector's light fall on what
-    stands still and on one another.
+    stands still and on one another; in the light of ``others`` they cast none.
     """
     if not capsules:
         return None
@@ -85,7 +93,29 @@ def overlay(
         shapes, bounds - (left, top, left, top), ray,
         BASELINE_M, view.depth_m, view.incidence_rad, view.lit, view.reflects,
     )  # fmt: skip
+    if others and still.foreign is not None:
+        foreign = _foreign(view.depth_m, ray, camera, others)
+        view = replace(
+            view,
+            foreign=np.where(view.depth_m == still.depth_m[part], still.foreign[part], foreign),
+        )
     return view, Window(int(top), int(left), *still.depth_m.shape)
+
+
+def _foreign(
+    depth_m: Image, ray: Array, camera: CameraCalibration, others: Collection[Projector]
+) -> Image:
+    """Light (h, w) of other projectors, in shares of the own one's."""
+    if min(depth_m.shape) < _FEWEST:
+        return np.zeros_like(depth_m)
+    places = ray * depth_m[..., None]
+    normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
+    normals *= -np.sign(np.einsum("hwi,hwi->hw", normals, ray))[..., None]
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1), _SMALLEST)[..., None]
+    pose = camera.world_from_camera
+    flat = transform(pose, places.reshape(-1, 3)), normals.reshape(-1, 3) @ pose[:3, :3].T
+    total = np.sum([other.brightness(*flat) for other in others], axis=0)
+    return in_shares(total, Projector(camera, pose).brightness(*flat)).reshape(depth_m.shape)
 
 
 def _bounds(shapes: Array, camera: CameraCalibration) -> NDArray[np.int64]:

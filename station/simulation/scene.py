@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from station.core.errors import InputError
 from station.core.geometry import rigid, transform
 from station.core.lens import rays as lens_rays
 from station.core.rig import CameraCalibration, Rig
-from station.simulation.noise import BASELINE_M, TrueView
+from station.simulation.interference import BASELINE_M, Projector, in_shares
+from station.simulation.noise import Image, TrueView
 
 Array = NDArray[np.float64]
 Triangles = NDArray[np.int32]
@@ -234,8 +235,17 @@ class VirtualScene:
             ]
         )
 
-    def view(self, camera: CameraCalibration, world_from_camera: Array) -> TrueView:
-        """The view of a perfect sensor with the camera's lens at a pose."""
+    def view(
+        self,
+        camera: CameraCalibration,
+        world_from_camera: Array,
+        others: Collection[Projector] = (),
+    ) -> TrueView:
+        """The view of a perfect sensor with the camera's lens at a pose.
+
+        Args:
+            others: projectors of further sensors that shine, too.
+        """
         height, width = camera.height, camera.width
         turned = lens_rays(camera).astype(np.float64) @ world_from_camera[:3, :3].T
         found = self._scene.cast_rays(_rays(world_from_camera[:3, 3], turned))
@@ -250,14 +260,37 @@ class VirtualScene:
         lit, reflects = np.zeros_like(hit), np.ones_like(hit)
         lit[hit] = self._lit(world_from_camera, turned[hit] * depth[hit][:, None])
         reflects[hit] = ~self._dark[found["primitive_ids"].numpy()[hit]]
-        return TrueView(depth, incidence, lit, reflects)
+        foreign = None
+        if others:
+            foreign = np.zeros((height, width), np.float32)
+            own = Projector(camera, world_from_camera)
+            foreign[hit] = self._foreign(own, others, turned[hit] * depth[hit][:, None], normals)
+        return TrueView(depth, incidence, lit, reflects, foreign)
+
+    def _foreign(
+        self, own: Projector, others: Collection[Projector], away: Array, normals: Array
+    ) -> Image:
+        """Light (n,) of other projectors on points (n, 3), from the camera, in shares of the own
+        one's."""
+        places = away + own.world_from_camera[:3, 3]
+        outwards = normals * -np.sign(np.einsum("ni,ni->n", normals, away))[:, None]
+        total = np.zeros(len(places))
+        for other in others:
+            light = other.brightness(places, outwards)
+            reached = light > 0.0
+            reached[reached] = self._reached(other.place_m, places[reached] - other.place_m)
+            total += np.where(reached, light, 0.0)
+        return in_shares(total, own.brightness(places, outwards))
 
     def _lit(self, world_from_camera: Array, away: Array) -> NDArray[np.bool_]:
         """Mask of the points (n, 3), from the camera, that its projector beside it reaches."""
         projector = transform(world_from_camera, (BASELINE_M, 0.0, 0.0))
-        towards = away - (projector - world_from_camera[:3, 3])
-        towards *= 1.0 - _SHADOW_TOLERANCE_M / _lengths(towards)[:, None]
-        return ~self._scene.test_occlusions(_rays(projector, towards), tfar=1.0).numpy()
+        return self._reached(projector, away - (projector - world_from_camera[:3, 3]))
+
+    def _reached(self, projector: Array, towards: Array) -> NDArray[np.bool_]:
+        """Mask (n,) of the ways (n, 3) from a projector that nothing stands in."""
+        short = towards * (1.0 - _SHADOW_TOLERANCE_M / _lengths(towards)[:, None])
+        return ~self._scene.test_occlusions(_rays(projector, short), tfar=1.0).numpy()
 
 
 def _rays(origin: Array, directions: Array) -> o3d.core.Tensor:

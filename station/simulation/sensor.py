@@ -16,6 +16,7 @@ from station.core.kinect_v1 import DEPTH_SCALE_M, depth_of_raw
 from station.core.rig import CameraCalibration, Rig
 from station.sensors.recording import RecordedFrame
 from station.simulation import violations
+from station.simulation.interference import Projector
 from station.simulation.noise import NoiselessView, UnitError
 from station.simulation.scene import (
     Mesh,
@@ -77,6 +78,22 @@ class SimulatedBooth:
             floor = bent(floor, lambda x, y: violations.bow_m(self.violations, self.seed, x, y))
         return [floor, *walls, *self.clutter]
 
+    def true_pose(self, camera: CameraCalibration) -> Array:
+        """World from camera (4, 4), as it stands."""
+        moved = self.moved_cameras.get(camera.name)
+        believed = camera.world_from_camera
+        return believed if moved is None else believed @ se3_exp(moved)
+
+    def disturbing(self, name: str) -> list[Projector]:
+        """Projectors whose light disturbs a camera."""
+        if violations.INTERFERENCE not in self.violations:
+            return []
+        return [
+            Projector(other, self.true_pose(other))
+            for other in self.rig.cameras.values()
+            if other.name != name and other.name not in self.dead_cameras
+        ]
+
 
 @dataclass(frozen=True, slots=True)
 class VirtualFrame:
@@ -115,6 +132,7 @@ class SimulatedUnit:
                 violations.zero_plane(booth.violations, booth.seed, index),
                 violations.frozen_share(booth.violations),
                 (booth.seed, index, 10),
+                violations.interference(booth.violations, booth.seed, index),
             ),
             camera=violations.true_lens(
                 booth.violations, booth.seed, index, booth.rig.cameras[name]
@@ -172,15 +190,14 @@ class VirtualCamera:
         lean_m = sway_m * float(np.sin(2.0 * np.pi * turns))
         lean_m = _LEAN_STEP_M * round(lean_m / _LEAN_STEP_M)
         if lean_m not in self._views:
-            pose = camera.world_from_camera
-            if camera.name in booth.moved_cameras:
-                pose = pose @ se3_exp(booth.moved_cameras[camera.name])
             meshes = booth.fixtures
             if self._body is not None:
                 meshes.append(_leaning(self._body, lean_m))
             if not meshes:
                 raise InputError("the virtual booth holds nothing to look at")
-            view = VirtualScene(meshes).view(camera, pose)
+            view = VirtualScene(meshes).view(
+                camera, booth.true_pose(camera), booth.disturbing(camera.name)
+            )
             self._views[lean_m] = NoiselessView.of(view, self.unit.error)
         return self._views[lean_m]
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.core.rig import CameraCalibration
+from station.simulation.interference import Interference
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,8 @@ HAND = "hand"
 RAW_LAW = "raw-law"
 """Raw values by libfreenect's own law (its zero-plane constants, a little different in each unit),
 decoded by the tangent law."""
+INTERFERENCE = "interference"
+"""The sensors' patterns disturb each other where they overlap: none of ``ALL``."""
 ALL = (BIAS, LENS, K1, FLOOR, BALL, OVAL, FROZEN, HELPER, HAND, RAW_LAW)
 
 _BIAS_RMS_M, _BIAS_AT_M = 1.5e-3, 1.7
@@ -130,6 +133,18 @@ def extra_gain(switches: frozenset[str], seed: int, unit: int) -> float:
 def frozen_share(switches: frozenset[str]) -> float:
     """Share of the noise's variance that is the same in every frame."""
     return _FROZEN_SHARE if FROZEN in switches else 0.0
+
+
+_LOST, _WRONG, _NOISE, _LASTING = (0.05, 0.2), (0.05, 0.3), (0.5, 2.0), (0.5, 0.95)
+
+
+def interference(switches: frozenset[str], seed: int, unit: int) -> Interference | None:
+    """How a unit takes the light of the others, where the booth's sensors disturb each other."""
+    if INTERFERENCE not in switches:
+        return None
+    rng = _rng(seed, 14, unit)
+    lost, wrong, noise, lasting = (rng.uniform(*ends) for ends in (_LOST, _WRONG, _NOISE, _LASTING))
+    return Interference(lost, wrong, noise, lasting, (seed, 4711, 15, unit))
 
 
 def true_lens(

@@ -51,6 +51,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "raw law": (violations.RAW_LAW,),
     "hand, helper": (violations.HAND, violations.HELPER),
     "all": violations.ALL,
+    "interference": (violations.INTERFERENCE,),
 }
 _DIRECT = [name for name in CASES if name != "hand, helper"]
 _HANGING_ONLY = "slope"
