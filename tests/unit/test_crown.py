@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from station.core.geometry import rigid, so3_exp, transform
-from station.core.lens import rays
+from station.core.geometry import invert, rigid, so3_exp, transform
+from station.core.lens import project, rays
 from station.core.rig import PredictedError
 from station.simulation.scene import (
     Mesh,
@@ -106,6 +106,20 @@ def test_a_camera_on_its_side_has_the_projectors_shadow_over_the_head(
     model: BodyModel, body: np.ndarray
 ) -> None:
     assert not len(_reach(model, _view(model, body, ROLLED), body).place)
+
+
+def test_patches_that_are_lost_behind_a_head_do_not_raise_it(
+    model: BodyModel, body: np.ndarray
+) -> None:
+    whole = _view(model, body)
+    top = np.argmax(body[:, 2])
+    u, v = (int(x) for x in np.rint(project(UPPER, transform(invert(POSE), body[top]))))
+    disturbed = whole.depth_m.copy()
+    patch = disturbed[v - 6 : v + 2, u - 1 : u + 2]
+    patch[patch > 2.0] = 0.0
+    found = _reach(model, replace(whole, depth_m=disturbed), body)
+    expected = np.mean(_reach(model, whole, body).residual_m)
+    assert np.mean(found.residual_m) == pytest.approx(expected, abs=0.0005)
 
 
 def test_a_stick_above_the_head_is_not_its_end(model: BodyModel, body: np.ndarray) -> None:

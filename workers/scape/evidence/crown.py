@@ -71,6 +71,9 @@ _FARTHEST_M = 0.012
 or a hand."""
 _MIN_COLUMNS = 6
 """Fewer columns are not used."""
+_STRAY_PX = 2.5
+"""Columns that differ more from the others show a gap in the booth's readings, not the head's end:
+sensors whose patterns overlap lose patches of what stands behind a head."""
 _SIGMA_M = 0.0015
 """Standard deviation of one camera's observation, however many columns it has: half a pixel, or
 0.05 degrees of its pose."""
@@ -187,6 +190,7 @@ def _rows_of(view: CameraView, pose: Array, cap: _Cap) -> tuple[Rows, bool]:
         # Dark hair gives no readings either, so a lower last reading does not mean a lower head.
         if not used.any() or np.median(distance[used]) < 0.0:
             return _NO_ROWS, False
+    used[used] = np.abs(distance[used] - np.median(distance[used])) < _STRAY_PX * pixel_m[used]
     count = int(used.sum())
     if count < _MIN_COLUMNS or abs(np.median(distance[used])) > _FARTHEST_M:
         return _NO_ROWS, False
