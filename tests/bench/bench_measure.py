@@ -8,7 +8,8 @@
 An ordinary day: each body in a pose of its own, up to 3 cm off the mark, swaying by up to 3 mm,
 each camera off its calibration by up to 1 mm and 0.05 degrees. Unlike bodies: sculpted, before
 sensors that err otherwise than the fit assumes (unlike_bodies.py, unlike_sensor.py). Noisy: bodies
-of the family before sensors two fifths of whose noise stay from frame to frame.
+of the family before sensors two fifths of whose noise stay from frame to frame. Disturbed: bodies
+of the family before sensors whose patterns overlap, of which the intervals were not learned.
 """
 
 from __future__ import annotations
@@ -233,6 +234,9 @@ def main() -> None:
     parser.add_argument(
         "--noisy", type=int, default=20, help="before sensors with noise that stays"
     )
+    parser.add_argument(
+        "--disturbed", type=int, default=20, help="before sensors whose patterns overlap"
+    )
     parser.add_argument("--anew", type=int, default=10, help="scans of one body standing anew")
     parser.add_argument(
         "--calibrate",
@@ -255,6 +259,9 @@ def main() -> None:
         scans = accepted(studio.population("test", arguments.bodies * 5 // 4), arguments.bodies)
         unlike = accepted(studio.unlike("test", arguments.unlike), arguments.unlike)
         noisy = accepted(studio.noisy("test", arguments.noisy * 5 // 4), arguments.noisy)
+        disturbed = accepted(
+            studio.disturbed("test", arguments.disturbed * 5 // 4), arguments.disturbed
+        )
         again = accepted(studio.anew(arguments.anew), arguments.anew)
     print_all(model, scans, FAMILY)
     if unlike:
@@ -263,6 +270,9 @@ def main() -> None:
     if noisy:
         print("\nthe family before sensors with noise that stays from frame to frame")
         print_all(model, noisy, NOISY)
+    if disturbed:
+        print("\nthe family before sensors whose patterns overlap")
+        print_all(model, disturbed, NOISY)
     if again:
         repeated, _ = measured_in(model, again)
         print_repeatability({pose: table_of(again, repeated[pose], pose) for pose in POSES})

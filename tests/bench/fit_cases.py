@@ -19,6 +19,7 @@ from station.core.geometry import rigid, so3_exp
 from station.core.rig import Rig
 from station.simulation.scene import Mesh, box, bumped, chair, default_rig, look_at
 from station.simulation.sensor import SimulatedBooth
+from station.simulation.violations import INTERFERENCE
 from workers.cloud.observed import PointCloud
 from workers.scape.learn.database import PARTS, body_database
 from workers.scape.model.body_model import BodyModel
@@ -156,6 +157,7 @@ def hard_cases(bodies: TestBodies) -> Iterator[Case]:
         ),
         ("dark hair and briefs", Mesh(body.vertices, body.faces, dark), day),
         ("sway 10 mm", body, replace(day, sway_m=0.01)),
+        ("patterns overlap", body, replace(day, violations=frozenset({INTERFERENCE}))),
         ("chair and walls", body, replace(day, clutter=chair((0.75, 0.45)))),
         ("arms close", bodies.arms_close, day),
         ("pregnant", bodies.pregnant, day),

@@ -82,6 +82,10 @@ class Studio:
         """The first so many bodies of a split before sensors with noise that stays."""
         return self.population(split, count, frozenset({violations.FROZEN}))
 
+    def disturbed(self, split: Split, count: int) -> Iterator[Scan]:
+        """The first so many bodies of a split before sensors that disturb each other."""
+        return self.population(split, count, frozenset({violations.INTERFERENCE}))
+
     def unlike(self, split: UnlikeSplit, count: int) -> Iterator[Scan]:
         """The first so many sculpted bodies of a split, before sensors unlike the assumed ones."""
         bodies = UnlikeBodies(self.model, split)
