@@ -12,6 +12,7 @@ from station.calibration.detect.step_names import BALL, EMPTY
 from station.core.errors import FormatError
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
+from station.core.lens import project
 from station.core.rig import CameraCalibration
 from station.simulation.noise import UnitError, observe
 from station.simulation.procedure import VirtualProcedure
@@ -141,6 +142,22 @@ def test_single_losses_leave_the_ball_as_it_is(camera: CameraCalibration) -> Non
         assert torn is not None
         assert torn.points > 0.9 * whole.points
         assert np.linalg.norm(torn.center_m - whole.center_m) < 1e-3
+
+
+def test_patches_lost_all_around_leave_the_ball_as_it_is(camera: CameraCalibration) -> None:
+    """Another sensor's pattern takes them; beside each of them a finger was suspected."""
+    truth = transform(invert(camera.world_from_camera), CENTER)
+    u, v = (int(x) for x in np.rint(project(camera, truth)))
+    rng = np.random.default_rng(3)
+    found = []
+    for image in images(camera, [ball(CENTER, 0.1)], 12):
+        for row, column in rng.integers(-40, 41, (40, 2)):
+            image[v + row : v + row + 5, u + column : u + column + 5] = 0.0
+        found.append(find_ball(image, camera, 0.1, 0.0))
+    away = np.array([one.center_m - truth for one in found if one is not None])
+    assert len(away) >= 11
+    assert np.linalg.norm(away.mean(axis=0)) < 0.7e-3
+    assert np.linalg.norm(away, axis=1).max() < 3e-3
 
 
 def test_a_ball_of_another_size_is_found_and_told(camera: CameraCalibration) -> None:

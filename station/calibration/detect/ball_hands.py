@@ -29,6 +29,8 @@ _FINGER_M = 0.022
 _GAPS = 3
 """Missing readings within the averaging window that are an edge: single losses of one pixel in 200
 come so close together a few times in a ball of ten thousand pixels."""
+_SECTORS, _ALL_AROUND = 8, 7
+"""Sectors of a ball, and how many of them have gaps that no hand has made."""
 _FINGERS_SHOW_M = 1.7
 """Up to this distance a finger is as wide as the averaging window that reveals strays."""
 
@@ -79,14 +81,26 @@ def beside_gaps(
 
     A ball alone is seen whole up to the limit of incidence. Readings are missing at the edges of
     what stands out of it, and these gaps stay where they are when the ball is fitted to the
-    fingers, too, which hides how far they stand out: it has been moved by 5 mm.
+    fingers, too, which hides how far they stand out: it has been moved by 5 mm. Gaps all around are
+    no hand's: another sensor's pattern lies over the ball.
     """
-    cosine = ball_image(ray, center, radius)[1]
-    gaps = ((cosine > INCIDENCE_COSINE) & (part == 0.0)).astype(np.float32)
+    cap = ball_image(ray, center, radius)[1] > INCIDENCE_COSINE
+    gaps = (cap & (part == 0.0)).astype(np.float32)
     near = cv2.boxFilter(gaps, -1, (_STRAY_BLUR_PX, _STRAY_BLUR_PX), normalize=False)
     several = ((gaps > 0.0) & (near > _GAPS - 0.5)).astype(np.uint8)
+    if _sectors(several > 0, cap) >= _ALL_AROUND:
+        return np.zeros_like(cap)
     apart_px = cv2.distanceTransform(1 - several, cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.asarray(apart_px < _FINGER_M * camera.K[0, 0] / center[2])
+
+
+def _sectors(mask: Mask, cap: Mask) -> int:
+    """Number of the sectors around a cap's middle that a part of it lies in."""
+    if not mask.any():
+        return 0
+    (v, u), (rows, columns) = np.nonzero(mask), np.nonzero(cap)
+    angle = np.arctan2(v - rows.mean(), u - columns.mean())
+    return len(np.unique(np.floor((angle / np.pi + 1.0) * 0.5 * _SECTORS) % _SECTORS))
 
 
 def _held(
