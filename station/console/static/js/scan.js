@@ -19,6 +19,12 @@ const TOGETHER_MS = 250;
 let kept = null;
 const underway = ({ asking, current }) => asking !== null || (current !== null && !FINAL.includes(current.state));
 
+// Of a countdown that is over, nothing but what is heard meanwhile tells the view that is opened again.
+listen((kind, data) => {
+  const scan = kept?.current;
+  if (kind === 'scan' && scan?.scan_id === data.scan_id && !FINAL.includes(data.state)) scan.state = data.state;
+});
+
 export async function scan(main, session) {
   // Nobody knows how long a scan took whose end was awaited in another view.
   if (kept && !session.again) kept = underway(kept) ? { ...kept, pressed: null } : null;
@@ -283,6 +289,7 @@ export async function scan(main, session) {
   showTroubles(state);
   const looking = setInterval(look, TROUBLES_MS);
   const told = kept;
+  kept = null;
   if (told) ({ label, pressed, took } = told);
   ready();
   if (told?.asking) settle(told.asking);
