@@ -12,6 +12,7 @@ from live_console import API
 
 from station.archive.index import ScanIndex
 from station.booth.deletion import labelled, purge
+from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import Console
 from station.console.app import create_app
 from station.core.config_file import load_config
@@ -58,7 +59,8 @@ def test_a_blank_label_deletes_nothing(spool: Spool, option: list[str], label: s
     assert labelled(spool, label) == ["nameless"]
 
 
-def test_a_blank_label_deletes_nothing_by_the_api(tmp_path: Path) -> None:
+@pytest.mark.parametrize("label", [" ", MAX_LABEL_LENGTH * "e\u0301"], ids=["blank", "longest"])
+def test_a_label_of_no_scan_deletes_nothing_by_the_api(tmp_path: Path, label: str) -> None:
     path = tmp_path / "booth.toml"
     path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
     console = Console(load_config(path), path, logging.getLogger())
@@ -67,7 +69,7 @@ def test_a_blank_label_deletes_nothing_by_the_api(tmp_path: Path) -> None:
     async def answer() -> httpx.Response:
         transport = httpx.ASGITransport(create_app(console))
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
-            return await client.delete(f"{API}/scans", params={"label": " "})
+            return await client.delete(f"{API}/scans", params={"label": label})
 
     assert asyncio.run(answer()).status_code == 404
     assert console.spool.notes.ids() == ["a"]
