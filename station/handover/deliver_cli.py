@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,7 @@ class HandOver:
             elif errors:
                 problems.append(
                     f"deliver {name}: {len(errors)} not handed over ({errors[0]}); "
-                    "it will be retried"
+                    "it will be retried (at once: station deliver --now)"
                 )
         return {"waiting": counts, "problems": problems}
 
@@ -192,15 +193,23 @@ class HandOver:
 
 @click.command()
 @config_option
-def deliver(config_path: Path | None) -> None:
+@click.option("--now", is_flag=True, help="let the booth try at once what failed before, and end")
+def deliver(config_path: Path | None, now: bool) -> None:
     """Hand results over to the programs of [[deliver]]; `station run` starts it.
 
     \b
     Examples:
+      station deliver --now                  the share is back: do not wait for the next try
       station deliver --config booth.toml
     """
     config = load_config(find_config(config_path))
     if not config.deliver:
         raise BoothError("booth.toml has no [[deliver]]: there is nobody to hand results over to")
+    if now:
+        names = [section.name for section in config.deliver]
+        waiting = Counter(entry.target for entry in Ledger(config.spool.folder).try_now(names))
+        for name in names:
+            click.echo(f"deliver {name}: {waiting[name] or 'nothing'} to hand over")
+        return
     with only_process(config.runtime.folder, "deliver") as log:
         HandOver(config, log).run(stop_event())

@@ -13,21 +13,26 @@ import ssl
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.error import URLError
 
 import pytest
+from click.testing import CliRunner
 from waiting import wait_until
 
 from station.archive.records import ScanRecord
 from station.booth.deletion import purge_scans
 from station.booth.retention import Deleted
+from station.console.api.booth import hand_over
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
-from station.handover.deliver_cli import HandOver
+from station.handover.deliver_cli import HandOver, deliver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from station.handover.targets import HandOverError, _refusal, make_target
 
@@ -305,6 +310,24 @@ def test_a_share_that_is_back_gets_at_once_what_waits_for_it(
     handover.try_all("share", 1e9)
     assert ledger.waiting() == []
     assert {path.name for path in (tmp_path / "share").iterdir()} == set(_IDS)
+
+
+def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """Whoever had mended the share waited for up to an hour."""
+    ledger = Ledger(tmp_path / "spool")
+    later = Waiting("share", _IDS[0], tries=6, next_s=1e9 + 3600.0, error="does not exist")
+    for entry in (later, replace(later, target="gone")):
+        ledger.keep(entry)
+    done = CliRunner().invoke(deliver, ["--now", "--config", str(tmp_path / "booth.toml")])
+    assert done.output == "deliver share: 1 to hand over\n"
+    assert ledger.waiting() == [replace(later, target="gone"), replace(later, next_s=0.0)]
+    ledger.keep(later)
+    told: Any = SimpleNamespace(config=load_config(tmp_path / "booth.toml"), ledger=ledger)
+    assert [one.error for one in hand_over(told, told)] == ["does not exist"]
+    handover.try_all("share", 1e9)
+    assert ledger.receivers(_IDS[0]) == ["share"]
 
 
 def test_a_result_that_leaves_before_it_is_handed_over_is_told(
