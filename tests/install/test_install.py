@@ -240,6 +240,8 @@ def test_upgrade_and_downgrade_keep_what_the_shop_has(
         machine.run("apt-get", "install", "-y", "--allow-downgrades", f"/root/{step.name}")
         _ready(machine)
         assert _kept(machine) == before
+    _, version, _ = package.name.split("_")
+    assert machine.run("station", "--version").stdout.split()[-1] == version
     _scan(machine, "after an upgrade")
 
 
