@@ -186,8 +186,9 @@ class ScanIndex:
             for scan_id in gone:
                 database.execute("DELETE FROM scans WHERE scan_id = ?", [scan_id])
             for scan_id, place in found.items():
-                if rows.get(scan_id) != place:
-                    self._take(database, place, scan_id)
+                if rows.get(scan_id) != place and not self._take(database, place, scan_id):
+                    # The disk may read it at the next query.
+                    changed[place] = 0
             now_ns = time.time_ns()
             # A clock that was put back since does not come to the same tick before long.
             settled = {p: ns if abs(now_ns - ns) > _SETTLED_NS else 0 for p, ns in changed.items()}
@@ -204,10 +205,13 @@ class ScanIndex:
         except OSError:
             return 0
 
-    def _take(self, database: sqlite3.Connection, place: str, scan_id: str) -> None:
+    def _take(self, database: sqlite3.Connection, place: str, scan_id: str) -> bool:
+        """Read a scan anew; whether it could be read."""
         record = read_record(self._spool, place, scan_id)
         if record is None:
-            return
+            return True
+        if record.unreadable:
+            place = ""
         database.execute(
             "INSERT OR REPLACE INTO scans VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
@@ -217,6 +221,7 @@ class ScanIndex:
                 json.dumps(record.reasons), json.dumps(dict(record.seconds)),
             ],
         )  # fmt: skip
+        return not record.unreadable
 
 
 def _create(path: Path) -> None:

@@ -29,7 +29,7 @@ SPEAKERS = (
     "station/booth/health.py",
     "station/booth/deletion.py", "station/booth/retention.py",
     "station/core/spool.py", "station/messaging/transport.py",
-    "station/core/depth/intrinsics.py",
+    "station/core/depth/intrinsics.py", "station/archive/records.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
     "station/calibration/drift/depths.py",
     "station/calibration/drift/people.py",
