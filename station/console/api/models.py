@@ -88,6 +88,7 @@ class BoothState(BaseModel):
     running: bool
     fault: str = Field(description="why no station answers; empty if one does")
     problems: list[str] = Field(description="what is wrong and what to do, the worst first")
+    remarks: list[str] = Field(description="what scans are corrected for")
     can_scan: bool = Field(
         description="nothing is in the way of a scan, other than sensors that are stopped"
     )

@@ -9,9 +9,10 @@ const HAND_OVER = /^deliver /;
 // the way of scans.
 export function troubles(state) {
   if (!state.running) return [t('booth.notRunning', { fault: said(state.fault) })];
-  if (state.problems.length) {
-    const [late, ...others] = state.problems.filter((problem) => HAND_OVER.test(problem));
-    const told = state.problems.filter((problem) => !HAND_OVER.test(problem)).map(said);
+  const sentences = [...state.problems, ...state.remarks];
+  if (sentences.length) {
+    const [late, ...others] = sentences.filter((sentence) => HAND_OVER.test(sentence));
+    const told = sentences.filter((sentence) => !HAND_OVER.test(sentence)).map(said);
     if (!late) return told;
     const more = others.length ? ` (${t('booth.moreWaiting', { n: others.length })})` : '';
     return [...told, said(late) + more];
