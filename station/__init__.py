@@ -28,12 +28,14 @@ def _checked_out() -> str:
     # Few commands ask for it.
     import subprocess
 
-    root = os.path.dirname(os.path.dirname(__file__))
-    if not os.path.exists(os.path.join(root, ".git")):
+    place = os.path.join(os.path.dirname(os.path.dirname(__file__)), ".git")
+    if not os.path.exists(place):
         return ""
-    command = ["git", "log", "-1", "--format=%ct %H"]
+    # What a hook of another repository sets names that one; what users set changes `git log`.
+    command = ["git", f"--git-dir={place}", "rev-list", "--timestamp", "--max-count=1", "HEAD"]
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
-        told = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+        told = subprocess.run(command, env=own, capture_output=True, text=True, check=False)
     except OSError:
         return ""
     return told.stdout.strip()

@@ -1,6 +1,7 @@
 """The version names the commit, of a checkout and of what is built."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,11 +15,11 @@ from workers.cli import reconstruct
 ROOT = Path(__file__).parents[2]
 
 
-def _told(folder: Path) -> str:
+def _told(folder: Path, **environment: str) -> str:
     """Version of the programs in a folder."""
     told = subprocess.check_output(
         [sys.executable, "-c", "import station; print(station.version())"],
-        env={**os.environ, "PYTHONPATH": str(folder)}, cwd=folder, text=True,
+        env={**os.environ, "PYTHONPATH": str(folder), **environment}, cwd=folder, text=True,
     )  # fmt: skip
     return told.strip()
 
@@ -40,3 +41,21 @@ def test_what_is_built_names_the_commit_that_it_is_of(tmp_path: Path) -> None:
     # A copy that git did not make.
     (tmp_path / "station/__init__.py").write_bytes((ROOT / "station/__init__.py").read_bytes())
     assert _told(tmp_path) == station.__version__
+
+
+def test_a_checkout_names_its_own_commit_whatever_is_set_for_git(tmp_path: Path) -> None:
+    """In a hook of another repository it named a commit of that one; where `git log` shows
+    signatures, nothing that asks for the version worked."""
+    other, git = tmp_path / "other", tmp_path / "bin/git"
+    subprocess.run(["git", "init", "-q", other], check=True)
+    git.parent.mkdir()
+    git.write_text(
+        '#!/bin/sh\ncase "$*" in *log*) echo "No signature" ;; esac\n'
+        f'exec {shutil.which("git")} "$@"\n'
+    )
+    git.chmod(0o755)
+    path = f"{git.parent}:{os.environ['PATH']}"
+    assert _told(ROOT, GIT_DIR=f"{other}/.git", PATH=path) == station.version()
+    assert "+git" in station.version()
+    # Without git.
+    assert _told(ROOT, PATH=str(other)) == station.__version__
