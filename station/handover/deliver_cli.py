@@ -19,7 +19,13 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError, SpoolError
 from station.core.scans import ScanId
-from station.core.service import Heartbeat, only_process, stop_event
+from station.core.service import (
+    NOTHING_RUNS,
+    Heartbeat,
+    anything_runs,
+    only_process,
+    stop_event,
+)
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
 from station.handover.targets import make_target
@@ -210,6 +216,8 @@ def deliver(config_path: Path | None, now: bool) -> None:
         waiting = Counter(entry.target for entry in Ledger(config.spool.folder).try_now(names))
         for name in names:
             click.echo(f"deliver {name}: {waiting[name] or 'nothing'} to hand over")
+        if waiting and not anything_runs(config.runtime.folder):
+            click.echo(NOTHING_RUNS)
         return
     with only_process(config.runtime.folder, "deliver") as log:
         HandOver(config, log).run(stop_event())

@@ -82,9 +82,12 @@ class Ledger:
     def try_now(self, targets: Container[str]) -> list[Waiting]:
         """Make the next try of all that waits for these targets due; what waits for them."""
         found = [entry for entry in self.waiting() if entry.target in targets]
-        for entry in found:
-            self.keep(replace(entry, next_s=0.0))
-        return found
+        due = [replace(entry, next_s=0.0) for entry in found]
+        for before, entry in zip(found, due, strict=True):
+            # To write one takes milliseconds, and there may be thousands.
+            if entry != before:
+                self.keep(entry)
+        return due
 
     def finish(self, entry: Waiting) -> None:
         """Mark a result as handed over."""

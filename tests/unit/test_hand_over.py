@@ -30,7 +30,10 @@ from station.booth.retention import Deleted
 from station.console.api.booth import hand_over
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
+from station.core.errors import BoothError
+from station.core.files import held, private_folder
 from station.core.scans import ScanId, ScanNote
+from station.core.service import NOTHING_RUNS
 from station.core.spool import Spool
 from station.handover.deliver_cli import HandOver, deliver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
@@ -320,12 +323,17 @@ def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
     later = Waiting("share", _IDS[0], tries=6, next_s=1e9 + 3600.0, error="does not exist")
     for entry in (later, replace(later, target="gone")):
         ledger.keep(entry)
-    done = CliRunner().invoke(deliver, ["--now", "--config", str(tmp_path / "booth.toml")])
-    assert done.output == "deliver share: 1 to hand over\n"
+    config = load_config(tmp_path / "booth.toml")
+    words = ["--now", "--config", str(tmp_path / "booth.toml")]
+    done = CliRunner().invoke(deliver, words)
+    assert done.output == f"deliver share: 1 to hand over\n{NOTHING_RUNS}\n"
     assert ledger.waiting() == [replace(later, target="gone"), replace(later, next_s=0.0)]
+    with held(private_folder(config.runtime.folder) / "deliver.lock", BoothError()):
+        assert CliRunner().invoke(deliver, words).output == "deliver share: 1 to hand over\n"
     ledger.keep(later)
-    told: Any = SimpleNamespace(config=load_config(tmp_path / "booth.toml"), ledger=ledger)
-    assert [one.error for one in hand_over(told, told)] == ["does not exist"]
+    told: Any = SimpleNamespace(config=config, ledger=ledger)
+    # The hour after which it would have been tried was told.
+    assert [(one.error, one.next_try) for one in hand_over(told, told)] == [("does not exist", "")]
     handover.try_all("share", 1e9)
     assert ledger.receivers(_IDS[0]) == ["share"]
 
