@@ -102,12 +102,15 @@ def _told(spool: Spool, place: str, scan_id: str, changed: str) -> ScanRecord:
 
 
 def _unread(spool: Spool, place: str, scan_id: str, changed: str, error: OSError) -> ScanRecord:
-    """A scan whose documents the disk refuses to read, with what its note tells."""
+    """A scan whose documents the disk refuses to read, with what its note tells.
+
+    A result is usable only if the note says so.
+    """
     note = None
     with suppress(OSError):
         note = spool.notes.read(ScanId(scan_id))
     state = PLACES[place]
-    if place == "outbox" and note is not None and note.verdict == "rescan":
+    if place == "outbox" and (note is None or note.verdict != "ok"):
         state = "rescan"
     return ScanRecord(
         scan_id=scan_id,

@@ -50,6 +50,7 @@ class HandOver:
         self._ledger = Ledger(config.spool.folder)
         self._index = ScanIndex(self._spool)
         self._targets = {section.name: make_target(section) for section in config.deliver}
+        self._without_rescans = {s.name for s in config.deliver if not s.rescans}
         self._round_s = dict.fromkeys(self._targets, time.monotonic())
         """Moment of each target's last progress, monotonic seconds."""
         self._refused: dict[str, str] = {}
@@ -108,7 +109,12 @@ class HandOver:
         found = self._index.find(states=["delivered", "rescan"], limit=_RESULTS)
         noted = self._spool.notes.ids()
         for section in self._config.deliver:
-            wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
+            # What cannot be read has its verdict when it can.
+            wanted = [
+                scan.scan_id
+                for scan in found
+                if scan.state == "delivered" or section.rescans or scan.unreadable
+            ]
             for entry in self._ledger.follow(section.name, wanted, noted):
                 # Whoever took it, or deleted it, may not know who has not received it.
                 if not self._spool.path("outbox", entry.scan_id).exists():
@@ -168,6 +174,13 @@ class HandOver:
         """
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
+            return False
+        if scan.unreadable:
+            # Its verdict may be another, and who has received it does not get it again.
+            self._postpone(entry, scan.reasons[0], ahead_s)
+            return False
+        if scan.state == "rescan" and entry.target in self._without_rescans:
+            self._ledger.drop(entry)
             return False
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))

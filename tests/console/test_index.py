@@ -69,6 +69,11 @@ def test_a_result_that_the_disk_refuses_to_read_is_told_as_such(
         assert told.reasons == (
             "its files cannot be read (Input/output error); check the spool's disk",
         )
+    # Of what nobody knows, nobody is told that it is usable.
+    spool.notes.remove(scan_id)
+    assert _got(index, scan_id).state == "rescan"
+    spool.notes.write(ScanNote(scan_id, "delivered", verdict="ok"), durable=False)
+    assert _got(index, scan_id).state == "delivered"
     monkeypatch.undo()
     assert (_got(index, scan_id).label, _got(index, scan_id).reasons) == ("訂單 9", ("arm",))
 

@@ -24,6 +24,7 @@ import pytest
 from click.testing import CliRunner
 from waiting import wait_until
 
+from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.booth.deletion import purge_scans
 from station.booth.retention import Deleted
@@ -31,7 +32,7 @@ from station.console.api.booth import hand_over
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
 from station.core.errors import BoothError
-from station.core.files import held, private_folder
+from station.core.files import held, private_folder, read_bounded_json
 from station.core.scans import ScanId, ScanNote
 from station.core.service import NOTHING_RUNS
 from station.core.spool import Spool
@@ -336,6 +337,34 @@ def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
     assert [(one.error, one.next_try) for one in hand_over(told, told)] == [("does not exist", "")]
     handover.try_all("share", 1e9)
     assert ledger.receivers(_IDS[0]) == ["share"]
+
+
+def test_a_result_that_the_disk_refuses_to_read_waits_until_its_verdict_is_known(
+    handover: HandOver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A webhook received it as usable, without its label, and never again."""
+    result = tmp_path / "spool/outbox" / _IDS[0] / "result.json"
+    taken: list[ScanRecord] = []
+    handover._targets["share"] = lambda scan, _: taken.append(scan)
+
+    def refused(path: Path, most_bytes: int) -> Any:
+        if path == result:
+            raise OSError(errno.EIO, "Input/output error")
+        return read_bounded_json(path, most_bytes)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("station.archive.records.read_bounded_json", refused)
+        handover.look()
+        handover.try_all("share", 1e9)
+    (waiting,) = Ledger(tmp_path / "spool").waiting()
+    assert (taken, waiting.tries) == ([], 1)
+    told = handover.health()["problems"][0]
+    assert in_language(told, "zh").startswith("移交 share：1 项尚未移交（它的文件无法读取（Input/")
+    # This target wants none that ask for another scan.
+    text = result.read_text()
+    result.write_text(text.replace('"ok"', '"rescan"'))
+    handover.try_all("share", 2e9)
+    assert (taken, Ledger(tmp_path / "spool").waiting()) == ([], [])
 
 
 def test_a_result_that_leaves_before_it_is_handed_over_is_told(
