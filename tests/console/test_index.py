@@ -54,9 +54,11 @@ def test_a_result_that_the_disk_refuses_to_read_is_told_as_such(
     """It was listed as usable, without its label, until its folder was moved."""
     index, scan_id = ScanIndex(spool), ScanId("20261123T100000Z-0003")
     spool.notes.write(ScanNote(scan_id, "delivered", "Order 9", verdict="rescan"), durable=False)
+    tries = []
 
     def refused(path: Path, most_bytes: int) -> Any:
         if path.parent.name == scan_id:
+            tries.append(path)
             raise OSError(errno.EIO, "Input/output error")
         return read_bounded_json(path, most_bytes)
 
@@ -69,12 +71,15 @@ def test_a_result_that_the_disk_refuses_to_read_is_told_as_such(
         assert told.reasons == (
             "its files cannot be read (Input/output error); check the spool's disk",
         )
+    # For each query the disk was asked again, and all others waited for it.
+    assert len(_got(ScanIndex(spool), scan_id).reasons) == len(tries) == 1
+    monkeypatch.setattr("station.archive.index._AGAIN_NS", 0)
     # Of what nobody knows, nobody is told that it is usable.
     spool.notes.remove(scan_id)
     assert _got(index, scan_id).state == "rescan"
     spool.notes.write(ScanNote(scan_id, "delivered", verdict="ok"), durable=False)
     assert _got(index, scan_id).state == "delivered"
-    monkeypatch.undo()
+    monkeypatch.setattr(records, "read_bounded_json", read_bounded_json)
     assert (_got(index, scan_id).label, _got(index, scan_id).reasons) == ("訂單 9", ("arm",))
 
 
