@@ -14,7 +14,7 @@ _SCRIPTS = Path(__file__).parents[2] / "deploy/package/body-booth"
 def test_an_upgrade_that_is_refused_leaves_the_commands(
     tmp_path: Path, off: str, running: bool
 ) -> None:
-    """Of a booth that was stopped, `station` was missing until the next boot."""
+    """The commands of a booth that was stopped were missing until the next boot."""
     told, flag = tmp_path / "told", tmp_path / "was-running"
     (tmp_path / "systemctl").write_text(f'#!/bin/sh\necho "$@" >>{told}\n')
     (tmp_path / "systemctl").chmod(0o755)
