@@ -7,8 +7,7 @@ from station.core.start.interrupts import loading
 with loading():
     import click
 
-    from station import __version__
-    from station.core.commands import LazyGroup, run
+    from station.core.commands import LazyGroup, run, version_option
 
 COMMANDS = {
     "run": ("station.booth.supervisor:run", "run the whole booth in the foreground"),
@@ -44,7 +43,7 @@ COMMANDS = {
 
 
 @click.group(cls=LazyGroup, lazy=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
+@version_option
 def station() -> None:
     """Run the body-scanning booth: four depth cameras, one scan, one body.
 

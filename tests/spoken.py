@@ -38,9 +38,9 @@ SPOKEN = [
     "the cloud shows only 12 % of the left forearm; the cloud shows only 12 % of the person's back",
     "camera a has moved since it was calibrated: by about 0.4 degrees (mostly clockwise)",
     "deliver orders: 3 not handed over (https://x cannot be reached (Connection refused)); it will "
-    "be retried",
+    "be retried (at once: station deliver --now)",
     "deliver orders: the target has not responded for 75 s; check the network and the other "
     "machine",
     "deliver share: 1 not handed over (/mnt/x does not exist; is the share mounted?); it will be "
-    "retried",
+    "retried (at once: station deliver --now)",
 ]

@@ -7,8 +7,7 @@ from station.core.start.interrupts import loading
 with loading():
     import click
 
-    from station import __version__
-    from station.core.commands import LazyGroup, run
+    from station.core.commands import LazyGroup, run, version_option
 
 COMMANDS = {
     "fit": ("workers.reconstruct.fit_cli:fit", "reconstruct one scan bundle or point cloud"),
@@ -27,7 +26,7 @@ COMMANDS = {
 
 
 @click.group(cls=LazyGroup, lazy=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
+@version_option
 def reconstruct() -> None:
     """Turn scan bundles into measured bodies.
 

@@ -29,6 +29,8 @@ from image import (
     virtual_environment,
 )
 
+from station import version_of_commit
+
 ROOT = Path(__file__).parents[2]
 BOOTH, SIMULATION = "body-booth", "body-booth-simulation"
 MOUNTED = {BOOTH: Path("/opt/booth"), SIMULATION: Path("/opt/booth.simulation")}
@@ -54,9 +56,7 @@ class Commit:
 
     @property
     def version(self) -> str:
-        """Versions of later commits sort after those of earlier ones."""
-        stamp = time.strftime("%Y%m%d.%H%M%S", time.gmtime(self.seconds))
-        return f"{_project_version()}+git{stamp}.{self.name[:7]}"
+        return version_of_commit(self.seconds, self.name)
 
 
 def main() -> None:
@@ -154,12 +154,6 @@ def _git(*words: str) -> str:
     return subprocess.run(
         ["git", *words], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
-
-
-def _project_version() -> str:
-    import tomllib
-
-    return str(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
 
 
 def _relative(path: Path) -> Path:

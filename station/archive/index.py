@@ -29,6 +29,11 @@ _OF_OTHER_TEXTS = 1
 _BUSY_S, _PAUSE_S = 10.0, 0.01
 _SETTLED_NS = 50_000_000
 """A folder that changed this recently may change again within the same tick of its clock."""
+_UNREAD = "?"
+"""Before the place of a scan that the disk refused to read; as a place, when it refused last."""
+_AGAIN_NS = 10_000_000_000
+"""Time until such a scan is read again. A failing disk may take seconds to refuse, for which all
+other queries wait."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS scans (
   scan_id TEXT PRIMARY KEY, place TEXT NOT NULL, state TEXT NOT NULL,
@@ -176,7 +181,8 @@ class ScanIndex:
         """Update the database to the current contents of the folders."""
         changed = {place: self._changed_ns(place) for place in PLACES}
         known = dict(database.execute("SELECT place, changed_ns FROM folders"))
-        if known == changed:
+        refused_ns = known.pop(_UNREAD, None)
+        if known == changed and not _is_over(refused_ns):
             return
         with _transaction(database):
             rows = dict(database.execute("SELECT scan_id, place FROM scans"))
@@ -185,12 +191,21 @@ class ScanIndex:
             gone = rows.keys() - found.keys()
             for scan_id in gone:
                 database.execute("DELETE FROM scans WHERE scan_id = ?", [scan_id])
+            # Another may have read them while this one waited for it.
+            refused = "SELECT changed_ns FROM folders WHERE place = ?"
+            refused_ns = next(database.execute(refused, [_UNREAD]), [None])[0]
+            if again := _is_over(refused_ns):
+                database.execute("DELETE FROM folders WHERE place = ?", [_UNREAD])
+            all_read = True
             for scan_id, place in found.items():
-                if rows.get(scan_id) != place:
-                    self._take(database, place, scan_id)
+                row = rows.get(scan_id)
+                if row != place and (again or row != _UNREAD + place):
+                    all_read &= self._take(database, place, scan_id)
             now_ns = time.time_ns()
             # A clock that was put back since does not come to the same tick before long.
             settled = {p: ns if abs(now_ns - ns) > _SETTLED_NS else 0 for p, ns in changed.items()}
+            if not all_read:
+                settled[_UNREAD] = now_ns
             database.executemany(
                 "INSERT OR REPLACE INTO folders VALUES (?, ?)", list(settled.items())
             )
@@ -204,10 +219,13 @@ class ScanIndex:
         except OSError:
             return 0
 
-    def _take(self, database: sqlite3.Connection, place: str, scan_id: str) -> None:
+    def _take(self, database: sqlite3.Connection, place: str, scan_id: str) -> bool:
+        """Read a scan anew; whether it could be read."""
         record = read_record(self._spool, place, scan_id)
         if record is None:
-            return
+            return True
+        if record.unreadable:
+            place = _UNREAD + place
         database.execute(
             "INSERT OR REPLACE INTO scans VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [
@@ -217,6 +235,12 @@ class ScanIndex:
                 json.dumps(record.reasons), json.dumps(dict(record.seconds)),
             ],
         )  # fmt: skip
+        return not record.unreadable
+
+
+def _is_over(refused_ns: int | None) -> bool:
+    """Whether scans that the disk refused to read are to be read again."""
+    return refused_ns is not None and not 0 <= time.time_ns() - refused_ns < _AGAIN_NS
 
 
 def _create(path: Path) -> None:

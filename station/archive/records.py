@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +22,7 @@ PLACES: dict[str, ScanState] = {
 }
 """Folder of the spool -> state; a result in the outbox may also ask for another scan. In the order
 in which a scan passes them: if a scan is in two, the later one counts."""
+_UNREADABLE = "its files cannot be read"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,11 @@ class ScanRecord:
         return self.state == "failed" and self.reasons == (CANCELLED,)
 
     @property
+    def unreadable(self) -> bool:
+        """Whether the disk refused to read what is told of it."""
+        return any(reason.startswith(_UNREADABLE) for reason in self.reasons)
+
+    @property
     def verdict(self) -> str:
         """ "ok", "rescan", "failed", or "" while it is not known."""
         return {"delivered": "ok", "rescan": "rescan", "failed": "failed"}.get(self.state, "")
@@ -57,6 +64,19 @@ def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
         changed = _moment(folder.stat().st_mtime)
     except OSError:
         return None
+    try:
+        return _told(spool, place, scan_id, changed)
+    except OSError as error:
+        return _unread(spool, place, scan_id, changed, error)
+
+
+def _told(spool: Spool, place: str, scan_id: str, changed: str) -> ScanRecord:
+    """A scan as its documents tell it.
+
+    Raises:
+        OSError: the disk refuses to read one.
+    """
+    folder = spool.path(place, scan_id)
     if place == "outbox":
         result = _read(folder / "result.json")
         # Results of earlier versions have no label; their bundle has, while it is kept.
@@ -78,6 +98,28 @@ def read_record(spool: Spool, place: str, scan_id: str) -> ScanRecord | None:
         finished=changed if place in ("outbox", "failed") else "",
         reasons=reasons,
         seconds=seconds,
+    )
+
+
+def _unread(spool: Spool, place: str, scan_id: str, changed: str, error: OSError) -> ScanRecord:
+    """A scan whose documents the disk refuses to read, with what its note tells.
+
+    A result is usable only if the note says so.
+    """
+    note = None
+    with suppress(OSError):
+        note = spool.notes.read(ScanId(scan_id))
+    state = PLACES[place]
+    if place == "outbox" and (note is None or note.verdict != "ok"):
+        state = "rescan"
+    return ScanRecord(
+        scan_id=scan_id,
+        state=state,
+        label=note.label if note is not None else "",
+        booth="",
+        created=moment_of(scan_id) or changed,
+        finished=changed if place in ("outbox", "failed") else "",
+        reasons=(f"{_UNREADABLE} ({error.strerror}); check the spool's disk",),
     )
 
 
@@ -136,9 +178,13 @@ def _seconds(found: object) -> dict[str, float]:
 
 def _read(path: Path) -> dict[str, Any]:
     """A JSON document of a scan; empty if there is none, or it is damaged: of one damaged scan the
-    others are listed."""
+    others are listed.
+
+    Raises:
+        OSError: the disk refuses to read it.
+    """
     try:
         document = read_bounded_json(path, MAX_JSON_BYTES)
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}

@@ -174,10 +174,11 @@ class ControlProcess:
         scan_id = scan_id_of(request.scan_id)
         if (known := self._known(scan_id)) is not None:
             return Reply(ok=True, content=known)
-        if len(request.label) > MAX_LABEL_LENGTH:
+        label = plain_label(request.label)
+        if len(label) > MAX_LABEL_LENGTH:
             return Reply(
                 ok=False,
-                error=f"the label has {len(request.label)} characters, {MAX_LABEL_LENGTH} are "
+                error=f"the label has {len(label)} characters, {MAX_LABEL_LENGTH} are "
                 "allowed; shorten it; no scan was started",
             )
         if not self._streaming:
@@ -191,7 +192,7 @@ class ControlProcess:
         note = ScanNote(
             scan_id,
             "armed",
-            label=plain_label(request.label),
+            label=label,
             valid_until_s=valid_until_s,
             boot=boot_id(),
         )

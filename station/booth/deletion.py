@@ -37,6 +37,9 @@ def labelled(spool: Spool, label: str) -> list[ScanId]:
     away.
 
     From the folders themselves: a full disk has no room for the index.
+
+    Raises:
+        SpoolError: one may have it, and the disk refuses to read it.
     """
     # What was there before a backup was restored is kept beside it.
     before = [Notes(folder) for folder in spool.folder.glob(".scans.before-restore*")]
@@ -48,6 +51,11 @@ def labelled(spool: Spool, label: str) -> list[ScanId]:
             record = read_record(spool, place, one)
             if record is not None and plain_label(record.label) == wanted:
                 found.add(one)
+            elif record is not None and record.unreadable and spool.notes.read(one) is None:
+                raise SpoolError(
+                    f"scan {one} may have this label, and its files cannot be read; check the "
+                    "spool's disk, or delete it by its id"
+                )
     return sorted(found)
 
 

@@ -58,6 +58,8 @@ class BoothHealth:
     free_bytes: int
     problems: list[str] = field(default_factory=list)
     """Problems with their remedies, the worst first; empty when there are none."""
+    remarks: list[str] = field(default_factory=list)
+    """Words on what scans are corrected for."""
     unusable: str = ""
     """Words on a calibration that the booth that runs takes no scans with; empty if it is sound."""
     cancelled: int = 0
@@ -84,12 +86,9 @@ def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
     hanging = {name for name in sync.get("silent", ()) if not reports(processes[f"capture {name}"])}
     wanted = bool(processes["control"].get("streaming"))
     problems += _cameras(sync, hanging, config.recorded, wanted=wanted)
-    problems += [
-        str(problem)
-        for content in processes.values()
-        if reports(content)
-        for problem in [*content.get("problems", []), *content.get("remarks", [])]
-    ]
+    told = [content for content in processes.values() if reports(content)]
+    problems += [str(problem) for content in told for problem in content.get("problems", [])]
+    remarks = [str(remark) for content in told for remark in content.get("remarks", [])]
     words = unusable(config) if reports(processes["sync"]) else ""
     # Sync says the same of sensors that it has seen.
     if words and words not in problems:
@@ -101,7 +100,9 @@ def booth_health(config: BoothConfig, path: Path | None = None) -> BoothHealth:
     stuck = [str(name) for name in workers.get("stuck", [])] if reports(workers) else []
     problems += [f"scan {name} is stuck in work; see the workers' log" for name in stuck]
     cancelled = _cancelled(config.spool.folder / "failed", spool.get("failed", 0))
-    return BoothHealth(processes, sync, spool, oldest_s, stuck, free, problems, words, cancelled)
+    return BoothHealth(
+        processes, sync, spool, oldest_s, stuck, free, problems, remarks, words, cancelled
+    )
 
 
 def scans_by_outcome(spool: Mapping[str, int], cancelled: int) -> dict[str, int]:

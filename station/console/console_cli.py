@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from station.console.security.certificate import make_certificate
+from station.console.security.certificate import make_certificate, reached_by
 from station.console.security.vault import SCOPES, Scope, Vault
 from station.core.commands import Number, config_option
 from station.core.config import BoothConfig
@@ -54,8 +54,12 @@ def _prepare(config: BoothConfig, set_password: bool, certificate: bool) -> None
         Vault(folder).set_password(text)
         click.echo("the password is set; everyone who was logged in has to log in again")
     if certificate:
-        path = make_certificate(folder, [*config.console.names, config.console.host])
-        click.echo(f"{path}: browsers will ask once whether to trust it")
+        names = reached_by([*config.console.names, config.console.host])
+        path = make_certificate(folder, names)
+        click.echo(
+            f"{path} is for {', '.join(names)}: make it again when an address changes; other names "
+            "go into console.names; browsers will ask once whether to trust it"
+        )
 
 
 @click.group()

@@ -19,6 +19,7 @@ from typing import Any
 
 import click
 
+from station import version
 from station.core.errors import BoothError, InputError
 from station.core.service import has_log, set_up_caches
 from station.core.start.interrupts import loading
@@ -29,6 +30,19 @@ config_option = click.option(
     "--config", "config_path", type=click.Path(path_type=Path), help="booth.toml"
 )
 """The configuration; without it `station.core.config_file.find_config` chooses."""
+
+
+def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        click.echo(f"{context.info_name}, version {version()}")
+        context.exit()
+
+
+version_option = click.option(
+    "--version", is_flag=True, expose_value=False, is_eager=True, callback=_show_version,
+    help="Show the version and exit.",
+)  # fmt: skip
+"""The version of these programs; click's own asks for it whatever the command is."""
 _OPTIONAL = {
     "open3d": "this command needs open3d, which is not part of the basic installation: apt "
     "install body-booth-simulation, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,13 @@ from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config
 from station.core.errors import BoothError, SpoolError
 from station.core.scans import ScanId
-from station.core.service import Heartbeat, only_process, stop_event
+from station.core.service import (
+    NOTHING_RUNS,
+    Heartbeat,
+    anything_runs,
+    only_process,
+    stop_event,
+)
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
 from station.handover.targets import make_target
@@ -43,6 +50,7 @@ class HandOver:
         self._ledger = Ledger(config.spool.folder)
         self._index = ScanIndex(self._spool)
         self._targets = {section.name: make_target(section) for section in config.deliver}
+        self._without_rescans = {s.name for s in config.deliver if not s.rescans}
         self._round_s = dict.fromkeys(self._targets, time.monotonic())
         """Moment of each target's last progress, monotonic seconds."""
         self._refused: dict[str, str] = {}
@@ -92,7 +100,7 @@ class HandOver:
             elif errors:
                 problems.append(
                     f"deliver {name}: {len(errors)} not handed over ({errors[0]}); "
-                    "it will be retried"
+                    "it will be retried (at once: station deliver --now)"
                 )
         return {"waiting": counts, "problems": problems}
 
@@ -101,7 +109,12 @@ class HandOver:
         found = self._index.find(states=["delivered", "rescan"], limit=_RESULTS)
         noted = self._spool.notes.ids()
         for section in self._config.deliver:
-            wanted = [s.scan_id for s in found if s.state == "delivered" or section.rescans]
+            # What cannot be read has its verdict when it can.
+            wanted = [
+                scan.scan_id
+                for scan in found
+                if scan.state == "delivered" or section.rescans or scan.unreadable
+            ]
             for entry in self._ledger.follow(section.name, wanted, noted):
                 # Whoever took it, or deleted it, may not know who has not received it.
                 if not self._spool.path("outbox", entry.scan_id).exists():
@@ -162,6 +175,13 @@ class HandOver:
         scan: ScanRecord | None = self._index.get(entry.scan_id)
         if scan is None:
             return False
+        if scan.unreadable:
+            # Its verdict may be another, and who has received it does not get it again.
+            self._postpone(entry, scan.reasons[0], ahead_s)
+            return False
+        if scan.state == "rescan" and entry.target in self._without_rescans:
+            self._ledger.drop(entry)
+            return False
         try:
             self._targets[entry.target](scan, self._spool.path("outbox", entry.scan_id))
         except BoothError as error:
@@ -192,15 +212,25 @@ class HandOver:
 
 @click.command()
 @config_option
-def deliver(config_path: Path | None) -> None:
+@click.option("--now", is_flag=True, help="let the booth try at once what failed before, and end")
+def deliver(config_path: Path | None, now: bool) -> None:
     """Hand results over to the programs of [[deliver]]; `station run` starts it.
 
     \b
     Examples:
+      station deliver --now                  the share is back: do not wait for the next try
       station deliver --config booth.toml
     """
     config = load_config(find_config(config_path))
     if not config.deliver:
         raise BoothError("booth.toml has no [[deliver]]: there is nobody to hand results over to")
+    if now:
+        names = [section.name for section in config.deliver]
+        waiting = Counter(entry.target for entry in Ledger(config.spool.folder).try_now(names))
+        for name in names:
+            click.echo(f"deliver {name}: {waiting[name] or 'nothing'} to hand over")
+        if waiting and not anything_runs(config.runtime.folder):
+            click.echo(NOTHING_RUNS)
+        return
     with only_process(config.runtime.folder, "deliver") as log:
         HandOver(config, log).run(stop_event())

@@ -7,7 +7,7 @@ handover/<target>/done/<scan id>           handed over; kept as long as the resu
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -78,6 +78,16 @@ class Ledger:
         """Save a waiting result."""
         path = self._place(entry.target, "waiting") / f"{entry.scan_id}.json"
         write_json(path, {"tries": entry.tries, "next_s": entry.next_s, "error": entry.error})
+
+    def try_now(self, targets: Container[str]) -> list[Waiting]:
+        """Make the next try of all that waits for these targets due; what waits for them."""
+        found = [entry for entry in self.waiting() if entry.target in targets]
+        due = [replace(entry, next_s=0.0) for entry in found]
+        for before, entry in zip(found, due, strict=True):
+            # To write one takes milliseconds, and there may be thousands.
+            if entry != before:
+                self.keep(entry)
+        return due
 
     def finish(self, entry: Waiting) -> None:
         """Mark a result as handed over."""

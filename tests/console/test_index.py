@@ -8,14 +8,16 @@ import sqlite3
 import threading
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from station.archive import records
 from station.archive.index import FILE, IndexBusyError, ScanIndex
-from station.archive.records import ScanRecord
+from station.archive.records import PLACES, ScanRecord
 from station.booth.deletion import labelled
-from station.core.files import write_json
-from station.core.scans import ScanId, scans_of
+from station.core.files import read_bounded_json, write_json
+from station.core.scans import ScanId, ScanNote, scans_of
 from station.core.spool import Spool
 
 
@@ -44,6 +46,41 @@ def test_scans_are_found_whatever_the_case_and_script(spool: Spool) -> None:
     assert failed.reasons == ("nobody there",)
     day = index.find(since="2026-11-21", until="2026-11-22")
     assert [scan.label for scan in day] == ["Order 1234"]
+
+
+def test_a_result_that_the_disk_refuses_to_read_is_told_as_such(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was listed as usable, without its label, until its folder was moved."""
+    index, scan_id = ScanIndex(spool), ScanId("20261123T100000Z-0003")
+    spool.notes.write(ScanNote(scan_id, "delivered", "Order 9", verdict="rescan"), durable=False)
+    tries = []
+
+    def refused(path: Path, most_bytes: int) -> Any:
+        if path.parent.name == scan_id:
+            tries.append(path)
+            raise OSError(errno.EIO, "Input/output error")
+        return read_bounded_json(path, most_bytes)
+
+    monkeypatch.setattr(records, "read_bounded_json", refused)
+    for place in PLACES:
+        os.utime(spool.folder / place, (1e9, 1e9))
+    for _ in range(2):
+        told = _got(index, scan_id)
+        assert (told.state, told.label) == ("rescan", "Order 9")
+        assert told.reasons == (
+            "its files cannot be read (Input/output error); check the spool's disk",
+        )
+    # For each query the disk was asked again, and all others waited for it.
+    assert len(_got(ScanIndex(spool), scan_id).reasons) == len(tries) == 1
+    monkeypatch.setattr("station.archive.index._AGAIN_NS", 0)
+    # Of what nobody knows, nobody is told that it is usable.
+    spool.notes.remove(scan_id)
+    assert _got(index, scan_id).state == "rescan"
+    spool.notes.write(ScanNote(scan_id, "delivered", verdict="ok"), durable=False)
+    assert _got(index, scan_id).state == "delivered"
+    monkeypatch.setattr(records, "read_bounded_json", read_bounded_json)
+    assert (_got(index, scan_id).label, _got(index, scan_id).reasons) == ("訂單 9", ("arm",))
 
 
 @pytest.mark.parametrize("given", ["J\u00fcrg M\u00fcller", "J\u00fcrg  Mu\u0308ller\n"])

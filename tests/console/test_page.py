@@ -9,7 +9,15 @@ import os
 import signal
 
 import pytest
-from console_page import LONG_MS, four_pictures_move, log_in, open_view, wait_for_value
+from console_page import (
+    LONG_MS,
+    events_by_hand,
+    four_pictures_move,
+    log_in,
+    open_view,
+    tell,
+    wait_for_value,
+)
 from live_console import LiveConsole
 from playwright.sync_api import Page, Route, expect
 
@@ -116,6 +124,28 @@ def test_a_scan_that_was_deleted_while_its_view_was_left_is_not_followed(
     open_view(fresh, console, "scan")
     expect(fresh.locator("#notices")).to_contain_text("This scan was deleted", timeout=LONG_MS)
     expect(fresh.locator("#go")).to_be_enabled(timeout=LONG_MS)
+
+
+def test_a_scan_that_was_taken_and_deleted_while_its_view_was_left_is_told_as_deleted(
+    page: Page, console: LiveConsole
+) -> None:
+    """It was left during the countdown, and told that the console had been restarted."""
+    scan = {"scan_id": "20260101T000000Z-dead", "label": "gone", "state": "countdown",
+            "reasons": [], "framesets": 0, "wanted": 0}  # fmt: skip
+    events_by_hand(page, console)
+    for place in ("**/api/v1/scans", f"**/scans/{scan['scan_id']}"):
+        page.route(place, lambda route: route.fulfill(json=scan))
+    open_view(page, console, "scan")
+    page.click("#go", timeout=LONG_MS)
+    expect(page.locator("#stage h2")).to_have_text("gone", timeout=LONG_MS)
+    open_view(page, console, "history")
+    expect(page.locator("#search")).to_be_visible(timeout=LONG_MS)
+    page.unroute_all()
+    for state in ("capturing", "failed"):
+        tell(page, "scan", scan_id=scan["scan_id"], state=state)
+    open_view(page, console, "scan")
+    expect(page.locator("#notices")).to_contain_text("This scan was deleted", timeout=LONG_MS)
+    expect(page.locator("#go")).to_be_enabled(timeout=LONG_MS)
 
 
 def test_a_person_whose_scan_is_cancelled_is_not_asked_for_another(

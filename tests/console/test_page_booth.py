@@ -10,7 +10,7 @@ import time
 import pytest
 from console_page import LONG_MS, open_view
 from live_console import LiveConsole
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import UNFINISHED
@@ -81,6 +81,22 @@ def test_nobody_is_said_to_be_absent_whom_no_camera_sees(page: Page, console: Li
             expect(presence).to_have_text("The sensors are off.", timeout=LONG_MS)
         finally:
             console.start_sensors()
+
+
+def test_what_waits_to_be_handed_over_can_be_tried_at_once(
+    page: Page, console: LiveConsole
+) -> None:
+    waits = {"target": "share", "scan_id": "20260101T000000Z-dead", "tries": 6, "next_try": "",
+             "error": "/mnt/x does not exist; is the share mounted?"}  # fmt: skip
+
+    def waiting(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "waiting_deliveries": [waits]})
+
+    page.route("**/api/v1/booth", waiting)
+    open_view(page, console, "booth")
+    with page.expect_response("**/booth/hand-over", timeout=LONG_MS) as answer:
+        page.click("#try-now", timeout=LONG_MS)
+    assert answer.value.status == 200
 
 
 def test_a_check_is_told_while_it_runs(page: Page, console: LiveConsole) -> None:

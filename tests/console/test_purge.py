@@ -4,18 +4,22 @@ import asyncio
 import errno
 import logging
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 from click.testing import CliRunner
 from live_console import API
 
+from station.archive import records
 from station.archive.index import ScanIndex
+from station.archive.phrases import in_language
 from station.booth.deletion import labelled, purge
+from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import Console
 from station.console.app import create_app
 from station.core.config_file import load_config
-from station.core.files import write_json
+from station.core.files import read_bounded_json, write_json
 from station.core.scans import ScanId, ScanNote
 from station.core.spool import Spool
 from station.handover.ledger import Ledger, Waiting
@@ -38,6 +42,28 @@ def test_purge_by_label(spool: Spool, option: list[str]) -> None:
     assert CliRunner().invoke(purge, ["x", "--old", *option]).exit_code == 2
 
 
+def test_purge_by_label_leaves_no_scan_that_may_have_it_without_a_word(
+    spool: Spool, option: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever deleted a person's scans was told that all were gone."""
+    kept = "20261121T100000Z-0001"
+
+    def refused(path: Path, most_bytes: int) -> Any:
+        if path.parent.name == kept:
+            raise OSError(errno.EIO, "Input/output error")
+        return read_bounded_json(path, most_bytes)
+
+    monkeypatch.setattr(records, "read_bounded_json", refused)
+    words = ["--label", "Order 1234", *option]
+    spool.notes.write(ScanNote(ScanId(kept), "delivered", "Order 9"), durable=False)
+    assert "there is no scan with the label" in str(CliRunner().invoke(purge, words).exception)
+    spool.notes.remove(ScanId(kept))
+    told = str(CliRunner().invoke(purge, words).exception)
+    assert told.startswith(f"scan {kept} may have this label, and its files cannot be read; check")
+    assert in_language(told, "zh").endswith("或按编号删除它")
+    assert CliRunner().invoke(purge, [kept, *option]).exit_code == 0
+
+
 def test_copies_that_were_handed_over_are_told_by_purge(spool: Spool, option: list[str]) -> None:
     ledger = Ledger(spool.folder)
     scan_id = "20261121T100000Z-0001"
@@ -58,7 +84,8 @@ def test_a_blank_label_deletes_nothing(spool: Spool, option: list[str], label: s
     assert labelled(spool, label) == ["nameless"]
 
 
-def test_a_blank_label_deletes_nothing_by_the_api(tmp_path: Path) -> None:
+@pytest.mark.parametrize("label", [" ", MAX_LABEL_LENGTH * "e\u0301"], ids=["blank", "longest"])
+def test_a_label_of_no_scan_deletes_nothing_by_the_api(tmp_path: Path, label: str) -> None:
     path = tmp_path / "booth.toml"
     path.write_text('[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n')
     console = Console(load_config(path), path, logging.getLogger())
@@ -67,7 +94,7 @@ def test_a_blank_label_deletes_nothing_by_the_api(tmp_path: Path) -> None:
     async def answer() -> httpx.Response:
         transport = httpx.ASGITransport(create_app(console))
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
-            return await client.delete(f"{API}/scans", params={"label": " "})
+            return await client.delete(f"{API}/scans", params={"label": label})
 
     assert asyncio.run(answer()).status_code == 404
     assert console.spool.notes.ids() == ["a"]

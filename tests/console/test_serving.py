@@ -9,9 +9,13 @@ import ssl
 import subprocess
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
+import psutil
 import pytest
+from click.testing import CliRunner
+from cryptography import x509
 from ctrl_c import heard
 from live_console import API, free_port
 from running_station import STATION
@@ -19,8 +23,9 @@ from waiting import wait_until
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from station.cli import station
 from station.console.api.console import Console
-from station.console.security.certificate import make_certificate
+from station.console.security.certificate import make_certificate, reached_by
 from station.console.server import _awaited_listener, check_exposure
 from station.core.config import ConsoleConfig
 from station.core.config_file import load_config
@@ -95,7 +100,37 @@ def test_beyond_this_machine_password_and_certificate_are_needed(tmp_path: Path)
         check_exposure(open_to_all, has_password=False)
     with pytest.raises(ConfigError, match="--make-certificate"):
         check_exposure(open_to_all, has_password=True)
-    path = make_certificate(tmp_path, ["booth.shop.example", "192.168.1.9"])
+    path = make_certificate(tmp_path, reached_by(["booth.shop.example", "192.168.1.9"]))
     assert check_exposure(open_to_all, has_password=True)
     assert ((tmp_path / "key.pem").stat().st_mode & 0o077) == 0
     ssl.create_default_context(cafile=str(path))
+
+
+def test_a_certificate_names_the_addresses_at_which_the_machine_is_reached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a console open to all was for 0.0.0.0, and a browser refused the machine's address
+    also where the certificate was trusted."""
+    inet, inet6, packet = socket.AF_INET, socket.AF_INET6, socket.AF_PACKET
+    found = {
+        "lo": [(inet, "127.0.0.1"), (inet6, "::1")],
+        "eth0": [(inet, "192.168.1.9"), (inet6, "fd00::9"), (inet6, "fe80::9%eth0"),
+                 (packet, "02:fc:00:00:00:01")],
+    }  # fmt: skip
+    links = {
+        name: [SimpleNamespace(family=family, address=address) for family, address in own]
+        for name, own in found.items()
+    }
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: links)
+    config = tmp_path / "booth.toml"
+    config.write_text(
+        '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
+        '[console]\nhost = "0.0.0.0"\nnames = ["booth.shop.example"]\n'
+    )
+    done = CliRunner().invoke(station, ["console", "--make-certificate", "--config", str(config)])
+    assert "192.168.1.9, fd00::9: make it again when an address changes" in done.output
+    made = x509.load_pem_x509_certificate((tmp_path / "console/certificate.pem").read_bytes())
+    names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    addresses = names.get_values_for_type(x509.IPAddress)
+    assert sorted(map(str, addresses)) == ["127.0.0.1", "192.168.1.9", "::1", "fd00::9"]
+    assert "booth.shop.example" in names.get_values_for_type(x509.DNSName)

@@ -67,7 +67,7 @@ def test_workers_import_the_core_of_the_station_alone() -> None:
         for path in _sources("workers")
         for module in _imports(path)
         if _under(module, ("station",))
-        and module not in ("station", "station.__version__")
+        and module not in ("station", "station.version")
         and not _under(module, ("station.core",))
     ]
     assert offenders == []

@@ -57,17 +57,21 @@ def test_the_page_knows_a_cancelled_scan(tmp_path: Path) -> None:
 
 def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
     """It knew of a fault of the station and of its disk, and of nothing else."""
-    well = {"running": True, "fault": "", "problems": [], "disk_free_mb": 9, "disk_needed_mb": 1}
+    well = {"running": True, "fault": "", "problems": [], "remarks": [], "disk_free_mb": 9,
+            "disk_needed_mb": 1}  # fmt: skip
     problems = [SPOKEN[6], "the booth is not calibrated, and takes no scans: run station calibrate"]
     late = SPOKEN[-3:]
     states = [well, {**well, "problems": problems}, {**well, "running": False}]
     states += [{**well, "problems": [*late, *problems]}, {**well, "problems": late[:1]}]
+    states += [{**well, "remarks": problems}, {**well, "remarks": problems, "disk_free_mb": 1}]
     said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
     assert said[:2] == [[], [in_language(text, "zh") for text in problems]]
     assert said[2] == ["扫描站没有响应："]
     # Three failing hand-overs filled the view that a scan is taken in.
     first = in_language(late[0], "zh")
-    assert said[3:] == [[*said[1], f"{first} (另有 2 项)"], [first]]
+    assert said[3:6] == [[*said[1], f"{first} (另有 2 项)"], [first], said[1]]
+    # A remark hid that the disk is nearly full.
+    assert said[6] == ["磁盘快满了：请删除旧扫描，否则将拒绝扫描。", *said[1]]
 
 
 def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ SPEAKERS = (
     "station/booth/health.py",
     "station/booth/deletion.py", "station/booth/retention.py",
     "station/core/spool.py", "station/messaging/transport.py",
-    "station/core/depth/intrinsics.py",
+    "station/core/depth/intrinsics.py", "station/archive/records.py",
     "station/calibration/drift/motion.py", "station/calibration/drift/watch.py",
     "station/calibration/drift/depths.py",
     "station/calibration/drift/people.py",
@@ -194,11 +194,14 @@ def test_what_follows_a_colon_is_said_in_chinese_too() -> None:
 
 
 def test_parts_of_a_calibrations_sentences_are_said_in_chinese() -> None:
-    """Advice with the frames behind it, and what is said of the camera that is the reference."""
+    """Advice, frames that wait, and what is said of the camera that is the reference."""
     covered = Coverage(default_rig().cameras, "front-upper", 0.1)
+    assert in_language(_wave_line(covered, 12.0, 6), "zh") == (
+        "已覆盖   0 %，12 秒：把球放在 front-lower 前（已清楚看到 0 次，共需 120 次）"
+    )
+    # A camera was named that had seen the ball in frames that nobody had looked at.
     assert in_language(_wave_line(covered, 12.0, 351), "zh") == (
-        "已覆盖   0 %，12 秒：把球放在 front-lower 前（已清楚看到 0 次，共需 120 次）；"
-        "还有 351 帧待处理"
+        "已覆盖   0 %，12 秒：还有 351 帧待处理"
     )
     assert in_language(_rest_line(["front", "back"]), "zh") == "看到静止的球：front, back"
     assert in_language(_rest_line([]), "zh") == "还没有看到静止的球"

@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from station.booth.control import ControlProcess
-from station.booth.session import UNSURE
+from station.booth.session import MAX_LABEL_LENGTH, UNSURE
+from station.console.api.models import NewScan
 from station.core.config import BoothConfig
 from station.core.errors import BoothError
 from station.core.scans import Notes, ScanId, ScanNote
@@ -63,6 +65,16 @@ def test_a_label_that_no_note_holds_is_refused(control: ControlProcess) -> None:
     assert not reply.ok
     assert "the label has 10000 characters" in reply.error
     assert not list((control._spool.folder / "scans").iterdir())
+
+
+def test_a_label_is_as_long_as_what_is_kept_of_it(control: ControlProcess) -> None:
+    """Accents that are spelled apart, as a Mac does, counted as characters of their own."""
+    label = MAX_LABEL_LENGTH * "e\u0301"
+    assert control._reply(Request("scan", "a", label, 1e9)).ok
+    assert NewScan(label=label).label == MAX_LABEL_LENGTH * "é"
+    assert not control._reply(Request("scan", "b", f"{label}e", 1e9)).ok
+    with pytest.raises(ValidationError, match="at most 200 characters"):
+        NewScan(label=f"{label}e")
 
 
 def test_a_label_is_kept_as_lists_show_it(control: ControlProcess) -> None:

@@ -235,20 +235,30 @@ def test_upgrade_and_downgrade_keep_what_the_shop_has(
     machine: Machine, package: Path, package_before: Path
 ) -> None:
     before = _kept(machine)
+    # A command that still runs: systemd told of a job that failed, and yet the booth was upgraded.
+    busy = machine.begin("/opt/booth/bin/python", "-c", "import time; time.sleep(3600)")
     for step in (package_before, package):
         machine.put(step, f"/root/{step.name}")
-        machine.run("apt-get", "install", "-y", "--allow-downgrades", f"/root/{step.name}")
+        install = ("apt-get", "install", "-y", "--allow-downgrades", f"/root/{step.name}")
+        assert "failed" not in machine.run(*install).stderr
+        assert busy.poll() is None
         _ready(machine)
         assert _kept(machine) == before
+    busy.kill()
+    _, version, _ = package.name.split("_")
+    assert machine.run("station", "--version").stdout.split()[-1] == version
     _scan(machine, "after an upgrade")
 
 
 def test_unknown_formats_are_refused_and_the_booth_goes_on(
     machine: Machine, package_before: Path
 ) -> None:
-    """An older package once would have met files that it cannot read."""
+    """An older package once would have met files that it cannot read, and a booth that was stopped
+    had no commands until the next boot."""
     install = ("apt-get", "install", "-y", "--allow-downgrades", f"/root/{package_before.name}")
-    for name in ("state.json", "calibration.json"):
+    for name, running in (("state.json", True), ("calibration.json", False)):
+        if not running:
+            machine.run("systemctl", "stop", "booth.target")
         path = machine.root / STATE.lstrip("/") / name
         known = path.read_text()
         path.write_text(re.sub('"version": 1', '"version": 99', known, count=1))
@@ -256,7 +266,10 @@ def test_unknown_formats_are_refused_and_the_booth_goes_on(
         path.write_text(known)
         assert refused.returncode != 0
         assert f"{name} has version 99" in refused.stdout + refused.stderr
-    _ready(machine)
+        machine.run("station", "--version")
+        if not running:
+            machine.run("systemctl", "start", "booth.target")
+        _ready(machine)
     _scan(machine, "after a refused downgrade")
 
 

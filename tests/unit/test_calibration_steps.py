@@ -174,7 +174,7 @@ def test_an_operator_is_told_when_what_he_sees_lags(
     wave_ball(feed, session, guide, reference="front-upper", lasts_s=1.0)
     lag = [text.endswith(" frames are still to be looked at") for text in told[:31]]
     assert lag == 30 * [False] + [True]
-    assert told[30].endswith("; 62 frames are still to be looked at")
+    assert told[30].endswith(": 62 frames are still to be looked at")
 
 
 class _Looks:

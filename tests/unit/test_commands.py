@@ -238,6 +238,14 @@ def test_rendering_that_is_told_to_end_leaves_no_semaphores(tmp_path: Path) -> N
     assert told == b""
 
 
+def test_a_calibration_is_not_recorded_that_would_be_refused(tmp_path: Path) -> None:
+    """A camera saw the ball too seldom in 10 s, which was told after minutes of rendering."""
+    words = ["record-virtual", "--out", str(tmp_path), "--calibration", "10"]
+    done = CliRunner().invoke(station_cli.station, words)
+    assert done.exit_code == 2
+    assert "10 is not from 16 up to 600 seconds" in done.output
+
+
 @pytest.mark.parametrize("name", ["booth.toml", "true-calibration.json", "back-upper"])
 def test_a_booth_is_not_recorded_over(tmp_path: Path, name: str) -> None:
     """Recordings and the configuration of another booth were replaced without a word."""

@@ -84,6 +84,24 @@ def test_a_step_without_a_cameras_recording_is_found_before_the_first_step(
     assert looked == []
 
 
+def test_a_step_that_cannot_be_added_to_the_calibration_in_use_says_what_can_be_done(
+    guided: tuple[Procedure, Session, list[str]],
+) -> None:
+    """There was nothing to "start again", and --new would have done more than the step."""
+    begun, session, _ = guided
+    calibrate = SimpleNamespace(ball_radius_m=0.12)
+    step = replace(begun, config=cast(BoothConfig, SimpleNamespace(calibrate=calibrate)))
+    fewer = dict(list(session.cameras.items())[1:])
+    for remedy in ("start again with station calibrate --new", "run station calibrate, which does"):
+        with pytest.raises(CalibrationError, match=f"is the same, or {remedy}"):
+            step._joined("wall-0", session.cameras)
+        with pytest.raises(CalibrationError, match=f"as they were, or {remedy}"):
+            step._joined("wall-0", fewer)
+        if begun.store.unfinished.exists():
+            rig = replace(default_rig(), created="2026-11-01T10:00:00Z")
+            begun.store.use(begun.store.finish(rig, {}).name)
+
+
 def _answers(monkeypatch: pytest.MonkeyPatch, confirmed: list[bool]) -> None:
     monkeypatch.setattr(click, "prompt", lambda *_, **__: "")
     monkeypatch.setattr(click, "confirm", lambda *_, **__: confirmed.pop(0))

@@ -13,21 +13,30 @@ import ssl
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.error import URLError
 
 import pytest
+from click.testing import CliRunner
 from waiting import wait_until
 
+from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.booth.deletion import purge_scans
 from station.booth.retention import Deleted
+from station.console.api.booth import hand_over
 from station.core.config import DeliverConfig
 from station.core.config_file import load_config
+from station.core.errors import BoothError
+from station.core.files import held, private_folder, read_bounded_json
 from station.core.scans import ScanId, ScanNote
+from station.core.service import NOTHING_RUNS
 from station.core.spool import Spool
-from station.handover.deliver_cli import HandOver
+from station.handover.deliver_cli import HandOver, deliver
 from station.handover.ledger import PAUSES_S, Ledger, Waiting
 from station.handover.targets import HandOverError, _refusal, make_target
 
@@ -305,6 +314,58 @@ def test_a_share_that_is_back_gets_at_once_what_waits_for_it(
     handover.try_all("share", 1e9)
     assert ledger.waiting() == []
     assert {path.name for path in (tmp_path / "share").iterdir()} == set(_IDS)
+
+
+def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """Whoever had mended the share waited for up to an hour."""
+    ledger = Ledger(tmp_path / "spool")
+    later = Waiting("share", _IDS[0], tries=6, next_s=1e9 + 3600.0, error="does not exist")
+    for entry in (later, replace(later, target="gone")):
+        ledger.keep(entry)
+    config = load_config(tmp_path / "booth.toml")
+    words = ["--now", "--config", str(tmp_path / "booth.toml")]
+    done = CliRunner().invoke(deliver, words)
+    assert done.output == f"deliver share: 1 to hand over\n{NOTHING_RUNS}\n"
+    assert ledger.waiting() == [replace(later, target="gone"), replace(later, next_s=0.0)]
+    with held(private_folder(config.runtime.folder) / "deliver.lock", BoothError()):
+        assert CliRunner().invoke(deliver, words).output == "deliver share: 1 to hand over\n"
+    ledger.keep(later)
+    told: Any = SimpleNamespace(config=config, ledger=ledger)
+    # The hour after which it would have been tried was told.
+    assert [(one.error, one.next_try) for one in hand_over(told, told)] == [("does not exist", "")]
+    handover.try_all("share", 1e9)
+    assert ledger.receivers(_IDS[0]) == ["share"]
+
+
+def test_a_result_that_the_disk_refuses_to_read_waits_until_its_verdict_is_known(
+    handover: HandOver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A webhook received it as usable, without its label, and never again."""
+    result = tmp_path / "spool/outbox" / _IDS[0] / "result.json"
+    taken: list[ScanRecord] = []
+    handover._targets["share"] = lambda scan, _: taken.append(scan)
+
+    def refused(path: Path, most_bytes: int) -> Any:
+        if path == result:
+            raise OSError(errno.EIO, "Input/output error")
+        return read_bounded_json(path, most_bytes)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("station.archive.records.read_bounded_json", refused)
+        handover.look()
+        handover.try_all("share", 1e9)
+    (waiting,) = Ledger(tmp_path / "spool").waiting()
+    assert (taken, waiting.tries) == ([], 1)
+    told = handover.health()["problems"][0]
+    assert in_language(told, "zh").startswith("移交 share：1 项尚未移交（它的文件无法读取（Input/")
+    monkeypatch.setattr("station.archive.index._AGAIN_NS", 0)
+    # This target wants none that ask for another scan.
+    text = result.read_text()
+    result.write_text(text.replace('"ok"', '"rescan"'))
+    handover.try_all("share", 2e9)
+    assert (taken, Ledger(tmp_path / "spool").waiting()) == ([], [])
 
 
 def test_a_result_that_leaves_before_it_is_handed_over_is_told(

@@ -446,6 +446,19 @@ def test_status_shows_framesets_per_second(
         assert sync._health()["framesets_hz"] == 0.0
 
 
+def test_a_remark_is_shown_and_is_no_problem(
+    config: BoothConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A monitor that counts problems raised an alarm for sensors that were a little warm."""
+    words = "all cameras see the booth 0.09 % farther away than when they were calibrated"
+    assert _problems(config, streaming=True, silent=[], cameras={}, remarks=[words]) == []
+    told = {**asdict(booth_health(config)), "streaming": True}
+    monkeypatch.setattr(asking, "ask", lambda *_: Reply(ok=True, content=told))
+    path = str(config.runtime.folder.parent / "booth.toml")
+    shown = CliRunner().invoke(status_cli.status, ["--config", path]).output
+    assert f"! {words}\n" in shown
+
+
 def test_status_says_of_no_result_that_it_was_handed_over(
     config: BoothConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from station import __version__
+from station import version
 from station.core.words.tables import FILES
 from workers.export.gltf import avatar_glb, mesh_glb
 from workers.export.meshes import obj_mesh, ply_cloud, ply_mesh
@@ -213,19 +213,16 @@ def result_document(
         },
         "iterations": fit.iterations,
         "seconds": seconds,
-        "versions": {
-            "body-booth": __version__,
-            "python": platform.python_version(),
-            **_library_versions(),
-        },
+        "versions": _versions(),
         "files": hashes,
     }
 
 
 @lru_cache(maxsize=1)
-def _library_versions() -> dict[str, str]:
-    """Versions of the libraries, which do not change while the program runs."""
-    return {name: metadata.version(name) for name in _LIBRARIES}
+def _versions() -> dict[str, str]:
+    """Versions of the programs and libraries, which do not change while they run."""
+    libraries = {name: metadata.version(name) for name in _LIBRARIES}
+    return {"body-booth": version(), "python": platform.python_version(), **libraries}
 
 
 def _json(document: dict[str, Any]) -> bytes:

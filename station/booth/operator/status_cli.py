@@ -107,3 +107,5 @@ def _show_status(content: Mapping[str, Any]) -> None:
     for problem in content["problems"]:
         if problem != NOTHING_RUNS or content["streaming"] is not None:  # else told as the error
             click.echo(f"! {problem}")
+    for remark in content.get("remarks", []):
+        click.echo(f"! {remark}")

@@ -24,6 +24,7 @@ from station.messaging.transport import ask_again
 from station.sensors.identity import calibrated_serials
 
 _SENSORS_S = 20.0
+_ANOTHER = "run station calibrate, which does all steps anew"
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +154,13 @@ class Attempt:
             )
             if self.store.in_use.exists():
                 self.guide.say("a new calibration; until it is solved, the other is in use")
-        else:
+        elif session.folder == self.store.unfinished:
             session.check_cameras(calibrated_serials(cameras))
             session.check_radius(self.config.calibrate.ball_radius_m)
-        if session.folder != self.store.unfinished:
+        else:
+            # Nothing was begun that could be started again.
+            session.check_cameras(calibrated_serials(cameras), _ANOTHER)
+            session.check_radius(self.config.calibrate.ball_radius_m, _ANOTHER)
             session = self.store.reopen(session.folder.name)
             self.guide.say(
                 f"added to what calibration {session.adds_to} was solved from; if a camera was "

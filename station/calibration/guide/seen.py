@@ -26,6 +26,7 @@ from station.core.files import local_time
 from station.core.rig import CameraCalibration
 from station.sensors.identity import calibrated_serials, differences
 
+_ANEW = "start again with station calibrate --new"
 _SAME_HEIGHT_M = 0.15
 """Heights of the ball that are nearer to each other are a measurement and its correction."""
 
@@ -60,11 +61,12 @@ class Seen:
     adds_to: str = ""
     """Name of the stored calibration that was taken up again."""
 
-    def check_cameras(self, serials: Mapping[str, str]) -> None:
+    def check_cameras(self, serials: Mapping[str, str], anew: str = _ANEW) -> None:
         """Refuse to mix what two different sets of cameras have seen.
 
         Args:
             serials: camera -> serial number, of all that the booth has now.
+            anew: words on how another calibration is begun.
 
         Raises:
             CalibrationError: naming the cameras that are others, missing or new.
@@ -73,11 +75,11 @@ class Seen:
             raise CalibrationError(
                 f"the calibration that was started at {local_time(self.started)} is of other "
                 f"cameras: {'; '.join(others)}; put the sensors and booth.toml back as they were, "
-                "or start again with station calibrate --new"
+                f"or {anew}"
             )
 
-    def check_radius(self, radius_m: float) -> None:
-        """Refuse to mix what was seen of two different balls.
+    def check_radius(self, radius_m: float, anew: str = _ANEW) -> None:
+        """Refuse to mix what was seen of two different balls; ``anew`` as in `check_cameras`.
 
         Raises:
             CalibrationError: the radius is another one.
@@ -86,8 +88,7 @@ class Seen:
             raise CalibrationError(
                 f"the calibration that was started at {local_time(self.started)} uses a ball with "
                 f"a radius of {self.radius_m:g} m, but booth.toml says {radius_m:g} m "
-                "(calibrate.ball_radius_m): set it back if the ball is the same, or start again "
-                "with station calibrate --new"
+                f"(calibrate.ball_radius_m): set it back if the ball is the same, or {anew}"
             )
 
     def lensed_cameras(self) -> dict[str, CameraCalibration]:

@@ -314,8 +314,9 @@ def _tell_waved(coverage: Coverage, guide: Guide, *, replaced: bool) -> None:
 
 def _wave_line(coverage: Coverage, left_s: float, waiting: int) -> str:
     time_left = f"{left_s:.0f} s" if left_s > 0 else "a little longer"
-    behind = f"; {waiting} frames are still to be looked at" if waiting > _MANY_WAIT else ""
-    return f"{100 * coverage.share:3.0f} % covered, {time_left}: {coverage.advice()}{behind}"
+    # They may show what the advice would ask for.
+    behind = f"{waiting} frames are still to be looked at" if waiting > _MANY_WAIT else ""
+    return f"{100 * coverage.share:3.0f} % covered, {time_left}: {behind or coverage.advice()}"
 
 
 def _empty_booth(session: Session) -> dict[str, StaticView]:

@@ -141,8 +141,7 @@ def _session(console: Console, caller: Caller | None) -> Session:
 @router.get("/booth", responses=responses(), tags=["booth"])
 def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
     """Cameras with their remedies, framesets, spool, disk, calibration, hand-overs."""
-    # Whom booth.toml no longer names is waited for by nobody.
-    targets = {target.name for target in console.config.deliver}
+    targets = _targets(console)
     return BoothState(
         **console.watch.booth(),
         calibration=_calibration_in_use(console),
@@ -153,6 +152,18 @@ def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
             if entry.target in targets
         ],
     )
+
+
+@router.post("/booth/hand-over", responses=responses(), tags=["booth"])
+def hand_over(console: Booth, caller: Scanner) -> list[Delivery]:  # noqa: ARG001
+    """Try at once what waits to be handed over; what waits."""
+    waiting = console.ledger.try_now(_targets(console))
+    return [Delivery(**entry.document()) for entry in waiting]
+
+
+def _targets(console: Console) -> set[str]:
+    # Whom booth.toml no longer names is waited for by nobody.
+    return {target.name for target in console.config.deliver}
 
 
 @router.post("/booth/start", responses=responses(409), tags=["booth"])

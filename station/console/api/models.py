@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
 from station.archive.tables import Unit
 from station.booth.session import MAX_LABEL_LENGTH
@@ -14,8 +15,15 @@ from station.core.words.terms import Language, Side
 State = Literal[
     "countdown", "armed", "capturing", "accepted", "reconstructing", "delivered", "rescan", "failed"
 ]
+COMPOSED = BeforeValidator(
+    lambda text: unicodedata.normalize("NFC", text) if isinstance(text, str) else text
+)
+"""Text in which a letter and its accents are one character, as in kept labels; named last, it comes
+before what text may be."""
 Label = Annotated[
-    str, StringConstraints(max_length=MAX_LABEL_LENGTH, pattern=r"^[^\x00-\x1f\x7f]*$")
+    str,
+    StringConstraints(max_length=MAX_LABEL_LENGTH, pattern=r"^[^\x00-\x1f\x7f]*$"),
+    COMPOSED,
 ]
 
 
@@ -80,6 +88,7 @@ class BoothState(BaseModel):
     running: bool
     fault: str = Field(description="why no station answers; empty if one does")
     problems: list[str] = Field(description="what is wrong and what to do, the worst first")
+    remarks: list[str] = Field(description="what scans are corrected for")
     can_scan: bool = Field(
         description="nothing is in the way of a scan, other than sensors that are stopped"
     )

@@ -25,7 +25,7 @@ from station.console.api.console import (
     key_of,
     once,
 )
-from station.console.api.models import NewScan, Removed, Scan, ScanPage
+from station.console.api.models import COMPOSED, NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, command
 from station.core.scans import boot_id, new_scan_id, plain_label, scan_id_of
@@ -43,10 +43,10 @@ def list_scans(
     console: Booth,
     caller: Reader,  # noqa: ARG001
     text: Annotated[
-        str, Query(max_length=MAX_LABEL_LENGTH, description="what label or id contains")
+        str, Query(max_length=MAX_LABEL_LENGTH, description="what label or id contains"), COMPOSED
     ] = "",
     label: Annotated[
-        str | None, Query(max_length=MAX_LABEL_LENGTH, description="the whole label")
+        str | None, Query(max_length=MAX_LABEL_LENGTH, description="the whole label"), COMPOSED
     ] = None,
     since: Annotated[str, Query(max_length=40, description="ISO 8601, UTC")] = "",
     until: Annotated[str, Query(max_length=40, description="ISO 8601, UTC, excluded")] = "",
@@ -158,7 +158,9 @@ def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
 @router.delete("", responses=responses(404, 409))
 def delete_label(
     label: Annotated[
-        str, Query(min_length=1, max_length=MAX_LABEL_LENGTH, description="the whole label")
+        str,
+        Query(min_length=1, max_length=MAX_LABEL_LENGTH, description="the whole label"),
+        COMPOSED,
     ],
     console: Booth,
     caller: Manager,

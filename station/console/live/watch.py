@@ -114,6 +114,7 @@ class Watch:
             "running": not self._fault,
             "fault": self._fault,
             "problems": list(status.get("problems", [])),
+            "remarks": list(status.get("remarks", [])),
             "can_scan": bool(status) and can_scan(self._config, status),
             "compiling": bool(status.get("processes", {}).get("workers", {}).get("compiling")),
             "streaming": bool(self._status.get("streaming", False)),

@@ -13,10 +13,25 @@ from station.core.files import private_folder, write_bytes
 CERTIFICATE, KEY = "certificate.pem", "key.pem"
 _DAYS = 825
 """The longest that Apple's devices accept (support.apple.com/103769)."""
+_EVERY = ("0.0.0.0", "::")
+"""Addresses of console.host that stand for all of the machine's."""
+
+
+def reached_by(names: Sequence[str]) -> list[str]:
+    """The host's names and addresses, and those given, by which browsers reach it."""
+    import psutil
+
+    host = socket.gethostname()
+    found = [host, f"{host}.local", "localhost", "127.0.0.1", *names]
+    for interface in psutil.net_if_addrs().values():
+        inet = [one for one in interface if one.family in (socket.AF_INET, socket.AF_INET6)]
+        # A link-local address is typed with the link's name, which no certificate can hold.
+        found += [one.address for one in inet if "%" not in one.address]
+    return [name for name in dict.fromkeys(found) if name not in _EVERY]
 
 
 def make_certificate(folder: Path, names: Sequence[str]) -> Path:
-    """Write `certificate.pem` and `key.pem` for the host's names and those given; return the first.
+    """Write `certificate.pem` and `key.pem` for a host's names and addresses; return the first.
 
     The key is P-256 and readable by its owner alone.
     """
@@ -25,9 +40,8 @@ def make_certificate(folder: Path, names: Sequence[str]) -> Path:
     from cryptography.hazmat.primitives.asymmetric import ec
 
     key = ec.generate_private_key(ec.SECP256R1())
-    host = socket.gethostname()
-    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, host[:64])])
-    every = dict.fromkeys([host, f"{host}.local", "localhost", "127.0.0.1", *names])
+    host = socket.gethostname()[:64]
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, host)])
     now = datetime.now(UTC)
     certificate = (
         x509.CertificateBuilder()
@@ -37,7 +51,7 @@ def make_certificate(folder: Path, names: Sequence[str]) -> Path:
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - timedelta(hours=1))
         .not_valid_after(now + timedelta(days=_DAYS))
-        .add_extension(x509.SubjectAlternativeName([_name(name) for name in every]), False)
+        .add_extension(x509.SubjectAlternativeName([_name(name) for name in names]), False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), True)
         .sign(key, hashes.SHA256())
     )

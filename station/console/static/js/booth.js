@@ -27,7 +27,10 @@ export async function booth(main) {
   const [banner, showTroubles] = troubleBanner();
   const checkText = h('p', { className: 'small' });
   const checkButton = h('button', { id: 'check', onclick: () => check() }, t('booth.checkNow'));
-  const deliveries = h('div', { className: 'card', hidden: true });
+  const waitingList = h('div');
+  const tryNow = h('button', { id: 'try-now', onclick: () => handOver() }, t('booth.tryNow'));
+  const deliveries = h('div', { className: 'card', hidden: true },
+    h('h2', {}, t('booth.deliveries')), waitingList, tryNow);
 
   async function switchSensors() {
     power.disabled = true;
@@ -36,6 +39,12 @@ export async function booth(main) {
     } catch (error) { notice(error.message, true); }
     await refresh();
     power.disabled = false;
+  }
+
+  async function handOver() {
+    tryNow.disabled = true;
+    try { await post('/booth/hand-over'); } catch (error) { notice(error.message, true); }
+    tryNow.disabled = false;
   }
 
   async function check() {
@@ -81,7 +90,7 @@ export async function booth(main) {
     checkButton.disabled = checking;
     const waiting = state.waiting_deliveries;
     deliveries.hidden = waiting.length === 0;
-    deliveries.replaceChildren(h('h2', {}, t('booth.deliveries')),
+    waitingList.replaceChildren(
       ...waiting.slice(0, 8).map((one) => h('p', { className: 'small' }, `${one.scan_id} → ${one.target}${one.error ? `: ${said(one.error)}` : ''}`)),
       waiting.length > 8 ? h('p', { className: 'small' }, t('booth.moreWaiting', { n: waiting.length - 8 })) : '');
   }

@@ -19,6 +19,12 @@ const TOGETHER_MS = 250;
 let kept = null;
 const underway = ({ asking, current }) => asking !== null || (current !== null && !FINAL.includes(current.state));
 
+// Of a countdown that is over, nothing but what is heard meanwhile tells the view that is opened again.
+listen((kind, data) => {
+  const scan = kept?.current;
+  if (kind === 'scan' && scan?.scan_id === data.scan_id && !FINAL.includes(data.state)) scan.state = data.state;
+});
+
 export async function scan(main, session) {
   // Nobody knows how long a scan took whose end was awaited in another view.
   if (kept && !session.again) kept = underway(kept) ? { ...kept, pressed: null } : null;
@@ -113,16 +119,25 @@ export async function scan(main, session) {
     show({ left_s: session.countdown_s });
   }
 
-  async function ask() {
-    if (!current) return;
+  // `unheard`: nothing was heard of it for a while. One that is not found was deleted then.
+  async function ask({ unheard = false } = {}) {
     const mine = current;
+    // A refusal may be the console's, which need not store it.
+    if (!mine || mine.state === 'failed') return;
     try {
-      const found = await get(`/scans/${current.scan_id}`);
+      const found = await get(`/scans/${mine.scan_id}`);
       if (current && found.scan_id === current.scan_id) take(found);
     } catch (error) {
+      if (error.kind !== 'no-such-scan' || mine !== current || closed) return;
       // The countdown was the console's, which has been started again; anything else is asked again.
-      if (error.status === 404 && mine === current && mine.state === 'countdown') take({ state: 'failed', reasons: [], unbegun: true });
+      if (mine.state === 'countdown') take({ state: 'failed', reasons: [], unbegun: true });
+      else if (unheard) deleted();
     }
+  }
+
+  function deleted() {
+    notice(t('scan.deleted'));
+    ready();
   }
 
   function take(found, more = {}) {
@@ -229,18 +244,6 @@ export async function scan(main, session) {
     listing = setTimeout(latest, TOGETHER_MS);
   }
 
-  // Whether what is told of the last scan was deleted while nothing was heard.
-  async function still() {
-    const mine = current;
-    // A countdown is the console's, and a refusal may be: neither needs to be stored.
-    if (!mine || ['countdown', 'failed'].includes(mine.state)) return;
-    try { await get(`/scans/${mine.scan_id}`); } catch (error) {
-      if (error.kind !== 'no-such-scan' || mine !== current || closed) return;
-      notice(t('scan.deleted'));
-      ready();
-    }
-  }
-
   async function look() {
     try {
       const told = await get('/booth');
@@ -263,12 +266,10 @@ export async function scan(main, session) {
     }
     const over = kind === 'scan' && ['failed', 'deleted', 'taken'].includes(data.state);
     if (over || ['job', 'result', 'reset', 'back'].includes(kind)) latestSoon();
-    if (kind === 'reset' || kind === 'back') still();
+    if (kind === 'reset' || kind === 'back') ask({ unheard: true });
     if (!current || data.scan_id !== current.scan_id) return;
-    if (kind === 'scan' && data.state === 'deleted') {
-      notice(t('scan.deleted'));
-      ready();
-    } else if (kind === 'scan' && data.state === 'taken') {
+    if (kind === 'scan' && data.state === 'deleted') deleted();
+    else if (kind === 'scan' && data.state === 'taken') {
       // The outcome stays, without its link.
       current = { ...current, gone: true };
       document.getElementById('open')?.remove();
@@ -288,13 +289,13 @@ export async function scan(main, session) {
   showTroubles(state);
   const looking = setInterval(look, TROUBLES_MS);
   const told = kept;
+  kept = null;
   if (told) ({ label, pressed, took } = told);
   ready();
   if (told?.asking) settle(told.asking);
   else if (told?.current) {
     follow(told.current);
-    ask();
-    still();
+    ask({ unheard: true });
   }
   latest();
   return () => {

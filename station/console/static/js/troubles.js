@@ -9,14 +9,14 @@ const HAND_OVER = /^deliver /;
 // the way of scans.
 export function troubles(state) {
   if (!state.running) return [t('booth.notRunning', { fault: said(state.fault) })];
+  const remarks = state.remarks.map(said);
   if (state.problems.length) {
     const [late, ...others] = state.problems.filter((problem) => HAND_OVER.test(problem));
     const told = state.problems.filter((problem) => !HAND_OVER.test(problem)).map(said);
-    if (!late) return told;
     const more = others.length ? ` (${t('booth.moreWaiting', { n: others.length })})` : '';
-    return [...told, said(late) + more];
+    return [...told, ...remarks, ...(late ? [said(late) + more] : [])];
   }
-  return state.disk_free_mb < 1.5 * state.disk_needed_mb ? [t('booth.diskLow')] : [];
+  return state.disk_free_mb < 1.5 * state.disk_needed_mb ? [t('booth.diskLow'), ...remarks] : remarks;
 }
 
 // A banner and the function that shows in it what is wrong now.
