@@ -191,6 +191,9 @@ def _ball(
     measured = 1.0 / reported(unit, pixels, depth) + rng.normal(0.0, np.sqrt(variance))
     patches = np.column_stack([pixels, measured, variance])
     seen_px = len(pixels) * _CELL_PX**2
+    # Where a detection lies says the lens that is believed.
+    beside = pixel_rays(procedure.booth.rig.cameras[lens.name], middle)
+    center = np.append(beside, 1.0) * center[2]
     return BallDetection(
         lens.name, 0.0, center, np.eye(3), seen_px, procedure.radius_m, 2e-3, patches
     )
