@@ -191,6 +191,9 @@ def _ball(
     measured = 1.0 / reported(unit, pixels, depth) + rng.normal(0.0, np.sqrt(variance))
     patches = np.column_stack([pixels, measured, variance])
     seen_px = len(pixels) * _CELL_PX**2
+    # Where a detection lies says the lens that is believed.
+    beside = pixel_rays(procedure.booth.rig.cameras[lens.name], middle)
+    center = np.append(beside, 1.0) * center[2]
     return BallDetection(
         lens.name, 0.0, center, np.eye(3), seen_px, procedure.radius_m, 2e-3, patches
     )
@@ -319,15 +322,17 @@ def _bumped(seen: Observations, camera: str) -> Observations:
     return _balls(seen, turned)
 
 
-def _moved(balls: Iterable[BallDetection], camera: str, shift_m: float) -> list[BallDetection]:
-    """The balls as a camera sees them that was shifted to its right."""
-    K = default_rig().cameras[camera].K
+def _moved(balls: Iterable[BallDetection], camera: str, xi: Sequence[float]) -> list[BallDetection]:
+    """The balls as a camera sees them that was turned and shifted: to its right, down, forward."""
+    lens, now_from_then = default_rig().cameras[camera], invert(se3_exp(xi))
     moved = []
     for ball in balls:
         if ball.camera == camera:
             patches = ball.patches.copy()
-            patches[:, 0] -= K[0, 0] * shift_m * patches[:, 2]
-            center_m = ball.center_m - (shift_m, 0.0, 0.0)
+            ray = np.column_stack([pixel_rays(lens, patches[:, :2]), np.ones(len(patches))])
+            points = transform(now_from_then, ray / patches[:, 2:3])
+            patches[:, :2], patches[:, 2] = project(lens, points), 1.0 / points[:, 2]
+            center_m = transform(now_from_then, ball.center_m)
             ball = replace(ball, center_m=center_m, patches=patches)
         moved.append(ball)
     return moved
@@ -338,13 +343,13 @@ def _nudged(seen: Observations, camera: str) -> Observations:
     middle_s = _middle(seen)
     early = [ball for ball in seen.balls if ball.time_s < middle_s]
     late = [ball for ball in seen.balls if ball.time_s >= middle_s]
-    return replace(seen, balls=[*early, *_moved(late, camera, 0.004)])
+    return replace(seen, balls=[*early, *_moved(late, camera, (0.0, 0.0, 0.0, 0.004, 0.0, 0.0))])
 
 
-def _moved_later(seen: Observations, camera: str) -> Observations:
-    """The camera is shifted by 6 mm after the waving."""
-    rest = {place: _moved(balls, camera, 0.006) for place, balls in seen.around.items()}
-    mark, front = (_moved(balls, camera, 0.006) for balls in (seen.mark, seen.front))
+def _moved_later(seen: Observations, camera: str, xi: Sequence[float]) -> Observations:
+    """The camera is shifted after the waving."""
+    rest = {place: _moved(balls, camera, xi) for place, balls in seen.around.items()}
+    mark, front = (_moved(balls, camera, xi) for balls in (seen.mark, seen.front))
     return replace(seen, mark=mark, front=front, around=rest)
 
 
@@ -411,7 +416,12 @@ FAULTS = (
     ),
     Fault(
         "a camera moved after the waving",
-        lambda seen: _moved_later(seen, "back-lower"),
+        lambda seen: _moved_later(seen, "back-lower", (0.0, 0.0, 0.0, 0.006, 0.0, 0.0)),
+        "it, or one beside it, was moved in between",
+    ),
+    Fault(
+        "a camera moved far after the waving",
+        lambda seen: _moved_later(seen, "front-lower", (-7e-3, 2e-3, -4e-3, 5e-3, 10e-3, -4e-3)),
         "it, or one beside it, was moved in between",
     ),
 )

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_calibration as synthetic
-from calibrated_booths import FRONT, REFERENCE, pair_errors, reference_errors, solved
+from calibrated_booths import (
+    FRONT,
+    REFERENCE,
+    normalised_square,
+    pair_errors,
+    reference_errors,
+    solved,
+)
 from numpy.typing import NDArray
 from scan_distortion import distortion
 
@@ -302,6 +309,22 @@ def test_a_sensor_far_off_its_factory_scale_is_believed(monkeypatch: pytest.Monk
     seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
     twists = reference_errors(rig, solved(rig, seen).world_poses)[0]
     assert np.linalg.norm(twists[:, 3:], axis=1).max() < 2e-3
+
+
+def test_a_lens_that_looks_elsewhere_than_its_driver_says_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Detections were compared with where a wrong lens had put them: from a principal point that
+    was 5 px off on, nothing settled, and heights or a floor that were right were blamed."""
+    monkeypatch.setattr(violations, "_CENTER_PX", 9.0)
+    procedure = VirtualProcedure(synthetic.booth(131, switches=(violations.LENS,)))
+    seen = synthetic.observations(procedure, rate_hz=RATE_HZ, boards=True, stands=True)
+    solution = solved(procedure.booth.rig, seen)
+    found = distortion(procedure.booth, solution.rig, load_mesh(BODY))
+    assert found.normal_rms_mm < 0.6
+    assert abs(found.height_mm) < 2.0
+    assert np.abs(found.girths_mm).max() < 5.0
+    assert normalised_square(procedure.booth.rig, solution.world_poses) < 3.0 * 18
 
 
 def test_an_oval_ball_does_not_part_the_front_from_the_back() -> None:

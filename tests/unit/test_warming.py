@@ -153,9 +153,9 @@ def test_changes_that_no_station_wrote_are_named(tmp_path: Path, changes: object
 
 
 def _changes(*common: float) -> dict[str, dict[str, float]]:
-    """Steps in which all cameras but one, that was bumped, show these changes."""
+    """Steps in which all cameras but one, which stays cold, show these changes."""
     return {
-        f"wall-{step}": {"a": change - 1e-5, "b": change + 2e-5, "c": change, "d": 4e-3}
+        f"wall-{step}": {"a": change - 1e-5, "b": change + 2e-5, "c": change, "d": 0.0}
         for step, change in enumerate(common)
     }
 
@@ -194,6 +194,38 @@ def test_a_slight_change_widens_what_is_stated() -> None:
     assert 1.96 * np.sqrt(widened.girth_sigma_m**2 - SAID.girth_sigma_m**2) > 2.1e-3
     with pytest.raises(CalibrationError, match="warm up for 20 minutes"):
         widen_by_warming(SAID, changes, 3e-3)
+
+
+def _alone(*changed: float) -> dict[str, dict[str, float]]:
+    """Steps in which one camera shows these changes, and the others a little common warmth."""
+    return {
+        f"wall-{step}": {"a": 4e-5, "b": 2e-5 + change, "c": -1e-5, "d": 3e-5}
+        for step, change in enumerate(changed)
+    }
+
+
+def test_one_sensor_that_warms_up_alone_is_named() -> None:
+    """It was seen and said nothing of: girths were up to 6.3 mm wrong, stated to 1.0."""
+    with pytest.raises(CalibrationError, match=r"camera b alone saw the booth 0\.10 % nearer"):
+        check_warm(_alone(0.0, -5e-4, -1e-3))
+    with pytest.raises(CalibrationError, match=r"camera b alone .* it was moved, or it warms up"):
+        check_warm(_alone(1e-3, 1e-3))
+
+
+def test_one_sensor_that_changes_slightly_widens_what_is_stated() -> None:
+    changes = _alone(0.0, 4e-4)
+    check_warm(changes)
+    assert "fasten camera b and let it warm up" in warming_words(changes)
+    widened = widen_by_warming(SAID, changes, 8e-3)
+    assert 1.96 * np.sqrt(widened.girth_sigma_m**2 - SAID.girth_sigma_m**2) > 2e-3
+    with pytest.raises(CalibrationError, match="camera b alone"):
+        widen_by_warming(SAID, changes, 2.5e-3)
+
+
+def test_two_cameras_of_four_say_nothing_of_the_others() -> None:
+    changes = {"mark": {"a": 1e-3, "b": 1e-3}, **_alone(0.0)}
+    check_warm(changes)
+    assert widen_by_warming(SAID, changes, 8e-3) == SAID
 
 
 def test_the_next_step_tells_what_the_solution_will_be_refused_for(

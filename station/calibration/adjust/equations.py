@@ -143,7 +143,7 @@ def corrected_centers(
 
     ``shape`` (n, 5) is the ball's in the camera's frame.
     """
-    centers = seen.centers.copy()
+    centers = model.seen_through(camera, parameters, seen.centers).copy()
     ray = pixel_rays(model.camera(camera, parameters), seen.pixels)
     for _ in range(4):
         rows = _rows_along(ray, seen, model, centers, parameters, radius_m, shape)

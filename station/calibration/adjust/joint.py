@@ -8,9 +8,12 @@ import numpy as np
 
 from station.calibration.adjust.normal import NormalEquations
 from station.calibration.adjust.problem import Layout, Problem, State, moved_state
-from station.calibration.adjust.residuals import FitQuality
+from station.calibration.adjust.residuals import DetectionResiduals, FitQuality
 
 _ITERATIONS = 30
+_CYCLES, _NEARLY = 6, 2.0
+"""Steps after which, and length of the last one (standard deviations) below which, a solution is
+taken to go in circles: a detection that is off pulls the path until it counts again."""
 
 
 def solve_joint(
@@ -35,7 +38,9 @@ def _settle(
 ) -> State:
     layout = Layout.of(problem)
     state, size = start, np.inf
-    for _ in range(iterations):
+    for taken in range(iterations):
+        if taken >= _CYCLES and size < _NEARLY:
+            problem = _without_rejected(problem, state)
         equations = NormalEquations(problem, layout, state, start.scale)
         step, path_step, size = equations.solve()
         state = moved_state(problem, layout, state, step)
@@ -49,3 +54,14 @@ def _settle(
         information, gradient = NormalEquations(problem, layout, state, state.scale).reduced()
         state = replace(state, information=information, gradient=gradient)
     return state
+
+
+def _without_rejected(problem: Problem, state: State) -> Problem:
+    """The problem without the waved detections that count for nothing: they shall not come back."""
+    waved = {
+        name: seen.take(DetectionResiduals.along_path(problem, state, seen).robust > 0.0)
+        if len(seen.times_s)
+        else seen
+        for name, seen in problem.waved.items()
+    }
+    return replace(problem, waved=waved)

@@ -58,7 +58,8 @@ class DetectionResiduals:
         pose = state.poses[seen.camera]
         basis = state.grid.basis(seen.times_s + state.clock_s[seen.camera])
         centers = (path_points(state.controls, *basis[:2]) - pose[:3, 3]) @ pose[:3, :3]
-        near = _near(centers, seen.centers)
+        camera, sensor = problem.cameras[seen.camera], state.sensors[seen.camera]
+        near = _near(centers, problem.model.seen_through(camera, sensor, seen.centers))
         shape = seen_shape(problem, state, seen.camera, seen.times_s)
         rows = _rows(problem, state, seen, near, shape)
         balls = _without_sensor(seen, rows).moved(centers - near)

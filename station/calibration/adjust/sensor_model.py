@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from station.core.depth.correction import DepthCorrection
 from station.core.depth.field import DepthField, linear_basis, quadratic_basis
 from station.core.kinect_v1 import registration_law
+from station.core.lens import pixel_rays, project
 from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
@@ -178,6 +179,13 @@ class SensorModel:
         K[:2, 2] += (cx, cy)
         distortion[0] += k1
         return replace(believed, K=K, distortion=distortion)
+
+    def seen_through(self, believed: CameraCalibration, parameters: Array, centers: Array) -> Array:
+        """Places (n, 3), at the same depths, of what the believed lens puts at ``centers``."""
+        if not self.lens or not len(centers):
+            return centers
+        ray = pixel_rays(self.camera(believed, parameters), project(believed, centers))
+        return np.column_stack([ray, np.ones(len(ray))]) * centers[:, 2:]
 
     def lens_design(self, camera: CameraCalibration, ray: Array) -> Array:
         """Derivatives (n, 2, 4) of rays x, y by focal length, principal point and k1.

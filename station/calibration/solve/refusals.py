@@ -176,7 +176,7 @@ def check_converged(state: State, largest_step: float = CONVERGED) -> None:
         raise CalibrationError(
             "the cameras do not agree on where the ball was: a head or another round object may "
             "have been taken for the ball; remove it, make sure that no camera moves, and wave the "
-            "ball again"
+            "ball again; if it says so again, check the lenses (station calibrate board)"
         )
 
 

@@ -86,8 +86,9 @@ def solve(
         problem, state = _final(problem, training, tested)
         world_poses = world.poses_in_world(problem, state, front_cameras)
         refusals.check_upright(world_poses)
-        refusals.check_solved_radius(problem, state)
+        # A camera that was moved far makes the ball seem another one, but not the other way round.
         refusals.check_unmoved(problem, state)
+        refusals.check_solved_radius(problem, state)
         resting_ball.check_doubts(problem, state)
         resting_ball.check_slope(problem, world_poses)
         resting_ball.check_mark(world_poses, radius_m)
