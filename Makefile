@@ -84,7 +84,7 @@ evaluate-model: $(VENV)/train.stamp
 	$(BIN)/reconstruct evaluate-model $(ARGS)
 
 intervals: $(VENV)/train.stamp
-	$(BIN)/python tests/bench/bench_measure.py --calibrate 64 $(ARGS)
+	$(BIN)/python tests/bench/bench_measure.py --calibrate 160 $(ARGS)
 
 package: $(VENV)/dev.stamp
 	$(BIN)/python deploy/package/build.py $(ARGS)

@@ -33,9 +33,9 @@ Array = NDArray[np.float64]
 
 POSES: tuple[Pose, ...] = ("as-scanned", "standard")
 CONTENTS = ("volume", "surface")
-_SEED = {"validation": 21, "test": 31}
+_SEEDS: dict[Split, tuple[int, ...]] = {"validation": (21, 22), "test": (31,)}
 _POOL = 96
-"""Bodies of a split that are drawn, however many of them are used."""
+"""Bodies that are drawn with each seed, however many of them are used."""
 _REPEAT_TURN_DEG = 1.5
 
 
@@ -68,15 +68,19 @@ class Studio:
         Args:
             switches: names of `station.simulation.violations` that the sensors have.
         """
-        shapes = self._database.sample(split, _POOL, _SEED[split])
-        poses = self._database.sample_poses(split, _POOL, _SEED[split])
-        for index in range(min(count, _POOL)):
-            name = "-".join((split, *sorted(switches), f"{index:03d}"))
-            one = shapes.take(np.array([index]))
-            posed = (self._posed(one, pose) for pose in np.roll(poses, -index, axis=0))
-            neutral = self._database.vertices(one)[0]
-            body = first_with_room(neutral, posed, self._database.faces)
-            yield self._scan(name, one, body, index, switches)
+        for pool, seed in enumerate(_SEEDS[split]):
+            first = pool * _POOL
+            if first >= count:
+                return
+            shapes = self._database.sample(split, _POOL, seed)
+            poses = self._database.sample_poses(split, _POOL, seed)
+            for index in range(min(count - first, _POOL)):
+                name = "-".join((split, *sorted(switches), f"{first + index:03d}"))
+                one = shapes.take(np.array([index]))
+                posed = (self._posed(one, pose) for pose in np.roll(poses, -index, axis=0))
+                neutral = self._database.vertices(one)[0]
+                body = first_with_room(neutral, posed, self._database.faces)
+                yield self._scan(name, one, body, first + index, switches)
 
     def noisy(self, split: Split, count: int) -> Iterator[Scan]:
         """The first so many bodies of a split before sensors with noise that stays."""
