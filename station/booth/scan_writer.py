@@ -16,10 +16,10 @@ from functools import partial
 from typing import TypeVar
 
 from station.booth.collection import LATE, Collection, Order
-from station.calibration.drift.look import Look, compared
-from station.calibration.drift.motion import CameraMove, depths_words
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.look import Look, compared
+from station.calibration.moves.motion import CameraMove, depths_words
 from station.core.bundle import CapturedFrame, write_bundle
 from station.core.config import BoothConfig
 from station.core.errors import BoothError, CalibrationError

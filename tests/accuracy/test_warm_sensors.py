@@ -9,8 +9,8 @@ import numpy as np
 from violated_scans import measured
 
 from station.calibration.detect.scene import static_view
-from station.calibration.drift.look import Look, compared
-from station.calibration.drift.reference import DriftReference
+from station.calibration.moves.look import Look, compared
+from station.calibration.moves.reference import DriftReference
 from station.core.bundle import Bundle, read_bundle
 from station.core.kinect_v1 import DEPTH_SCALE_M, depth_of_raw
 from station.core.rig import PredictedError, Rig

@@ -29,7 +29,8 @@ from moves import move_in
 from numpy.typing import NDArray
 from scipy.stats import beta, chi2
 
-from station.calibration.drift.motion import (
+from station.calibration.drift.watch import Doubts
+from station.calibration.moves.motion import (
     LEVER_M,
     MOVED_M,
     MOVED_RAD,
@@ -37,8 +38,7 @@ from station.calibration.drift.motion import (
     QUIET_RAD,
     CameraMove,
 )
-from station.calibration.drift.reference import DriftReference
-from station.calibration.drift.watch import Doubts
+from station.calibration.moves.reference import DriftReference
 
 FALSE_ALARMS_BAR, COVERAGE_BAR = 1e-3, 0.95
 SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)

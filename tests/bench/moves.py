@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import mean_view
-from station.calibration.drift.estimate import estimate_move
-from station.calibration.drift.motion import CameraMove
-from station.calibration.drift.reference import DriftReference
+from station.calibration.moves.estimate import estimate_move
+from station.calibration.moves.motion import CameraMove
+from station.calibration.moves.reference import DriftReference
 from station.core.kinect_v1 import DEPTH_SCALE_M
 
 

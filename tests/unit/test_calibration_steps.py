@@ -25,7 +25,7 @@ from station.calibration.guide.steps import look_at_empty_booth, look_at_wall, r
 from station.core.errors import CalibrationError
 from station.core.kinect_v1 import DEPTH_SCALE_M, INDEPENDENT_HZ, RANDOM_SIGMA, TABLE
 from station.sensors.recording import RecordedFrame, check_recording, write_recording
-from station.simulation.scene import Mesh, box, default_rig, load_mesh
+from station.simulation.scene import Mesh, box, bumped, default_rig, load_mesh
 from station.simulation.sensor import SimulatedBooth, VirtualCamera
 
 _CAMERAS = ("front-lower", "front-upper")
@@ -416,27 +416,50 @@ def test_depths_that_changed_are_noted_with_a_board(tmp_path: Path) -> None:
     assert session.depth_changes == {"wall-0": {name: pytest.approx(0.0, abs=1e-4)}}
 
 
+class _Shown(_Looks):
+    """A feed in which every camera sees the same twelve pictures."""
+
+    def __init__(self, pictures: list[np.ndarray]) -> None:
+        super().__init__(2.0)
+        self._pictures = pictures
+
+    def newest(self) -> list[TimedFrame]:
+        return [
+            TimedFrame(frame.camera, frame.time_s, self._pictures[self._next % 12], DEPTH_SCALE_M)
+            for frame in super().newest()
+        ]
+
+
+def _rested(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, empty: list[np.ndarray], now: list[np.ndarray]
+) -> Session:
+    """A calibration after the ball lay on the mark, of cameras that saw the empty booth before."""
+    rig = default_rig().cameras
+    session = Session.begin(folder, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
+    session.record_empty({name: static_view(empty, DEPTH_SCALE_M) for name in _CAMERAS}, [])
+    monkeypatch.setattr(finder, "find_ball", lambda *given, **_: ball(given[1].name, given[3]))
+    guide = Guide(attended=False, countdown_s=0.0)
+    session.record_resting(MARK, rest_ball(cast(Feed, _Shown(now)), session, guide, MARK))
+    return Session.load(folder)
+
+
 def test_depths_that_changed_are_noted_with_a_ball(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     empty = _pictures(SimulatedBooth(), None, 12)
-    warm = _warmer(empty)
+    session = _rested(tmp_path, monkeypatch, empty, _warmer(empty))
+    expected = {MARK: dict.fromkeys(_CAMERAS, pytest.approx(8e-4, abs=1e-4))}
+    assert session.depth_changes == expected
 
-    class Warm(_Looks):
-        def newest(self) -> list[TimedFrame]:
-            return [
-                TimedFrame(frame.camera, frame.time_s, warm[self._next % 12], DEPTH_SCALE_M)
-                for frame in super().newest()
-            ]
 
-    rig = default_rig().cameras
-    session = Session.begin(tmp_path, "2026", 0.1, {name: rig[name] for name in _CAMERAS})
-    session.record_empty({name: static_view(empty, DEPTH_SCALE_M) for name in _CAMERAS}, [])
-    monkeypatch.setattr(finder, "find_ball", lambda *given, **_: ball(given[1].name, given[3]))
-    balls = rest_ball(cast(Feed, Warm(2.0)), session, Guide(attended=False, countdown_s=0.0), MARK)
-    session.record_resting(MARK, balls)
-    changes = Session.load(tmp_path).depth_changes
-    assert changes == {MARK: dict.fromkeys(_CAMERAS, pytest.approx(8e-4, abs=1e-4))}
+def test_a_camera_that_was_nudged_after_the_empty_booth_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A calibration was accepted whose cameras were 17 mm off, and every scan refused after it."""
+    nudged = SimulatedBooth(moved_cameras={_CAMERAS[1]: bumped(0.008, np.radians(0.3))})
+    empty, now = (_pictures(booth, None, 12) for booth in (SimulatedBooth(), nudged))
+    with pytest.raises(CalibrationError, match="has moved since the empty booth was recorded: by"):
+        _rested(tmp_path, monkeypatch, empty, now)
 
 
 def _warmer(pictures: list[np.ndarray]) -> list[np.ndarray]:

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
-from station.calibration.drift.depths import ChangedDepths, SeenDepths, changed_depths
-from station.calibration.drift.look import Look, compared
-from station.calibration.drift.motion import depths_words
-from station.calibration.drift.reference import DriftReference
+from station.calibration.moves.depths import ChangedDepths, SeenDepths, changed_depths
+from station.calibration.moves.look import Look, compared
+from station.calibration.moves.motion import depths_words
+from station.calibration.moves.reference import DriftReference
 from station.core.depth.correction import DepthCorrection
 from station.core.depth.field import DepthField
 from station.core.geometry import se3_exp

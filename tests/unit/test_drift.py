@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, static_view
 from station.calibration.drift import check_cli
-from station.calibration.drift.depths import ChangedDepths
 from station.calibration.drift.last_check import keep_check, last_check
-from station.calibration.drift.motion import LEVER_M, CameraMove, depths_words
-from station.calibration.drift.reference import DriftReference, plane_slopes
 from station.calibration.guide.feed import Feed
+from station.calibration.moves.depths import ChangedDepths
+from station.calibration.moves.motion import LEVER_M, CameraMove, depths_words
+from station.calibration.moves.reference import DriftReference, plane_slopes
 from station.core.config_file import load_config
 from station.core.errors import CalibrationError, FormatError
 from station.core.geometry import se3_exp

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from station.booth.health import booth_health
 from station.calibration.drift.check_cli import check
 from station.calibration.drift.kept import FOLDER, problem_in_words, use_correction
-from station.calibration.drift.motion import LEVER_M
 from station.calibration.drift.people import ENOUGH, Drift, Evidence, corrected, find_drift
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.motion import LEVER_M
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.errors import CalibrationError

@@ -20,9 +20,9 @@ from station.booth import scan_writer
 from station.booth.collection import Collection, Order
 from station.booth.frameset import Frameset
 from station.booth.scan_writer import Ended, ScanWriter, Started
-from station.calibration.drift.look import Look
 from station.calibration.drift.watch import DriftWatch
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.look import Look
 from station.core.config import BoothConfig
 from station.core.config_file import load_config
 from station.core.rig import CameraCalibration, Rig

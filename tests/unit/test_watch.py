@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from station.calibration.detect.scene import static_view
-from station.calibration.drift.motion import QUIET_M, CameraMove
-from station.calibration.drift.reference import DriftReference
 from station.calibration.drift.watch import Doubts, DriftWatch
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.motion import QUIET_M, CameraMove
+from station.calibration.moves.reference import DriftReference
 from station.core.errors import CalibrationError
 from station.simulation.scene import default_rig
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import click
 import numpy as np
 
-from station.calibration.drift.depths import ChangedDepths, SeenDepths
 from station.calibration.drift.kept import use_correction
 from station.calibration.drift.last_check import keep_check
-from station.calibration.drift.look import Look, compared
-from station.calibration.drift.motion import CameraMove, depths_words, everything_words, move_words
-from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.feed import Feed, TimedFrame, gather_frames, live_feed, replayed_feed
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.depths import ChangedDepths, SeenDepths
+from station.calibration.moves.look import Look, compared
+from station.calibration.moves.motion import CameraMove, depths_words, everything_words, move_words
+from station.calibration.moves.reference import DriftReference
 from station.core.commands import at_most_one, config_option
 from station.core.config import BoothConfig
 from station.core.config_file import find_config, load_config

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from station.calibration.drift.motion import CameraMove
+from station.calibration.moves.motion import CameraMove
 from station.core.files import private_folder, utc_now, write_json
 
 _FILE = "last-check.json"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.drift.motion import LEVER_M, move_words
+from station.calibration.moves.motion import LEVER_M, move_words
 from station.core.geometry import invert, se3_exp, skew, transform
 from station.core.rig import Rig
 

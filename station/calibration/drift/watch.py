@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView
-from station.calibration.drift.look import Look
-from station.calibration.drift.motion import CameraMove
-from station.calibration.drift.reference import DriftReference
 from station.calibration.guide.store import CalibrationStore
+from station.calibration.moves.look import Look
+from station.calibration.moves.motion import CameraMove
+from station.calibration.moves.reference import DriftReference
 from station.core.errors import BoothError, CalibrationError
 from station.core.rig import CameraCalibration
 

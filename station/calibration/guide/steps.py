@@ -23,6 +23,8 @@ from station.calibration.guide.finder import BallFinder
 from station.calibration.guide.operator import Guide
 from station.calibration.guide.seen import Seen
 from station.calibration.guide.session import Session
+from station.calibration.moves.look import certainly_moved
+from station.calibration.moves.motion import move_words
 from station.core.errors import CalibrationError
 
 EMPTY_FIRST = "the empty booth has to be recorded first: station calibrate floor"
@@ -162,7 +164,13 @@ def rest_ball(feed: Feed, session: Session, guide: Guide, step: str) -> list[Bal
         for name, frames in last.items()
         if frames
     }
-    session.note_depths(step, _depth_changes(_empty_booth(session), looked))
+    empty = _empty_booth(session)
+    for move in certainly_moved(session.lensed_cameras(), empty, looked):
+        raise CalibrationError(
+            f"camera {move.camera} has moved since the empty booth was recorded: "
+            f"{move_words(move.known())}; fasten it; start again with station calibrate --new"
+        )
+    session.note_depths(step, _depth_changes(empty, looked))
     guide.done(f"the ball at rest is seen by {', '.join(still)}")
     return [ball for kept in still.values() for ball in kept]
 

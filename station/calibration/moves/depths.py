@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, smoothed
 from station.calibration.detect.warmth import BODY_M, common_change, depth_change, where_words
-from station.calibration.drift.alignment import sample_sigma, tukey
-from station.calibration.drift.motion import everything_words
-from station.calibration.drift.reference import DriftReference
+from station.calibration.moves.alignment import sample_sigma, tukey
+from station.calibration.moves.motion import everything_words
+from station.calibration.moves.reference import DriftReference
 from station.core.depth.images import Image
 from station.core.rig import Rig
 

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import StaticView, mean_view
-from station.calibration.drift.depths import (
+from station.calibration.moves.depths import (
     ChangedDepths,
     SeenDepths,
     changed_depths,
     seen_depths,
 )
-from station.calibration.drift.estimate import estimate_move
-from station.calibration.drift.motion import CameraMove
-from station.calibration.drift.reference import DriftReference
+from station.calibration.moves.estimate import estimate_move
+from station.calibration.moves.motion import CameraMove
+from station.calibration.moves.reference import DriftReference
 from station.core.depth.images import Image
+from station.core.rig import CameraCalibration
 
 Array = NDArray[np.float64]
 _UNCHANGED = np.zeros(1)
@@ -66,3 +67,21 @@ def compared(
     changed = changed_depths({n: looks[n].depths if n in looks else None for n in cameras})
     laws = changed.laws if changed is not None else {}
     return changed, [look.move(laws.get(name, _UNCHANGED)) for name, look in looks.items()]
+
+
+def certainly_moved(
+    cameras: Mapping[str, CameraCalibration],
+    empty: Mapping[str, StaticView],
+    looked: Mapping[str, tuple[Sequence[NDArray[np.uint16]], float]],
+) -> list[CameraMove]:
+    """Moves of the cameras that no longer stand, without doubt, where they saw the empty booth.
+
+    Args:
+        looked: camera -> frames (h, w) and their scale; people may stand in its view.
+    """
+    looks = {
+        name: Look.of(DriftReference.prepare(cameras[name], empty[name]), empty[name], *seen)
+        for name, seen in looked.items()
+        if name in empty
+    }
+    return [move for move in compared(looks, cameras)[1] if move.moved and move.certain]

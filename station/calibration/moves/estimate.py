@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.calibration.detect.scene import smoothed
-from station.calibration.drift.alignment import Alignment, align
-from station.calibration.drift.motion import CameraMove
-from station.calibration.drift.reference import BLOCK, DriftReference
+from station.calibration.moves.alignment import Alignment, align
+from station.calibration.moves.motion import CameraMove
+from station.calibration.moves.reference import BLOCK, DriftReference
 from station.core.depth.images import Image
 
 Array = NDArray[np.float64]

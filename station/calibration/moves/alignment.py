@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.calibration.drift.motion import LEVER_M, MIN_SHARE, CameraMove
-from station.calibration.drift.reference import COMMON, LOCAL, DriftReference
+from station.calibration.moves.motion import LEVER_M, MIN_SHARE, CameraMove
+from station.calibration.moves.reference import COMMON, LOCAL, DriftReference
 from station.core.depth.images import Image
 from station.core.geometry import invert, se3_exp, transform
 from station.core.kinect_v1 import FROZEN_SHARE
