@@ -69,7 +69,7 @@ def in_shares(foreign: Array, own: Array) -> Image:
 
 @dataclass(frozen=True, slots=True)
 class Interference:
-    """Response of one unit to foreign light, whose brightness is given in shares of its own light's."""
+    """Response of one unit to foreign light, whose brightness is in shares of its own light's."""
 
     lost: float
     """Share of the windows that fail where foreign light is as bright as its own."""
