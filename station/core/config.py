@@ -29,6 +29,14 @@ def _radius(radius_m: float) -> float:
     return radius_m
 
 
+def _host_name(name: str) -> str:
+    """A name as browsers and certificates have it: letters beyond ASCII are encoded (IDNA)."""
+    try:
+        return name.encode("idna").decode("ascii")
+    except UnicodeError:
+        raise ValueError(f"{name!r} is no name by which a computer can be reached") from None
+
+
 _AS_A_LIST = Field(strict=False)
 """TOML writes a tuple as a list."""
 _Value = TypeVar("_Value")
@@ -151,7 +159,7 @@ class ConsoleConfig(Strict):
     enabled: bool = Field(default=True, description="whether the station runs a console")
     host: str = Field(default="127.0.0.1", description="address to listen at; 0.0.0.0 for all")
     port: int = Field(default=8420, ge=1, le=65535)
-    names: Several[str] = Field(
+    names: Several[Annotated[str, AfterValidator(_host_name)]] = Field(
         default=(), description="names by which browsers reach it, besides the host's own"
     )
     folder: ConfigPath = Field(default=Path("console"), description="password, tokens, log")

@@ -125,7 +125,7 @@ def test_a_certificate_names_the_addresses_at_which_the_machine_is_reached(
     config = tmp_path / "booth.toml"
     config.write_text(
         '[[cameras]]\nname = "a"\ndriver = "recorded"\nrecording = "a"\n'
-        '[console]\nhost = "0.0.0.0"\nnames = ["booth.shop.example"]\n'
+        '[console]\nhost = "0.0.0.0"\nnames = ["booth.shop.example", "kabine-süd.example"]\n'
     )
     done = CliRunner().invoke(station, ["console", "--make-certificate", "--config", str(config)])
     assert "192.168.1.9, fd00::9: make it again when an address changes" in done.output
@@ -133,4 +133,5 @@ def test_a_certificate_names_the_addresses_at_which_the_machine_is_reached(
     names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     addresses = names.get_values_for_type(x509.IPAddress)
     assert sorted(map(str, addresses)) == ["127.0.0.1", "192.168.1.9", "::1", "fd00::9"]
-    assert "booth.shop.example" in names.get_values_for_type(x509.DNSName)
+    hosts = names.get_values_for_type(x509.DNSName)
+    assert {"booth.shop.example", "xn--kabine-sd-x9a.example"} <= set(hosts)
