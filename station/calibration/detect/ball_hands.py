@@ -85,17 +85,24 @@ def beside_gaps(
     A ball alone is seen whole up to the limit of incidence. Readings are missing at the edges of
     what stands out of it, and these gaps stay where they are when the ball is fitted to the
     fingers, too, which hides how far they stand out: it has been moved by 5 mm. Small gaps all
-    around are no hand's: another sensor's pattern lies over the ball.
+    around are no hand's: another sensor's pattern lies over the ball. Of a ball that the image's
+    border cuts nobody knows what is all around it.
     """
     cap = ball_image(ray, center, radius)[1] > INCIDENCE_COSINE
     gaps = (cap & (part == 0.0)).astype(np.float32)
     near = cv2.boxFilter(gaps, -1, (_STRAY_BLUR_PX, _STRAY_BLUR_PX), normalize=False)
     several = ((gaps > 0.0) & (near > _GAPS - 0.5)).astype(np.uint8)
     pixels_per_m = camera.K[0, 0] / center[2]
-    if _sectors(_small(several, _WIDEST_GAP_M * pixels_per_m), cap) >= _ALL_AROUND:
+    small = _small(several, _WIDEST_GAP_M * pixels_per_m)
+    if not _cut(cap) and _sectors(small, ray, center) >= _ALL_AROUND:
         return np.zeros_like(cap)
     apart_px = cv2.distanceTransform(1 - several, cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.asarray(apart_px < _FINGER_M * pixels_per_m)
+
+
+def _cut(cap: Mask) -> bool:
+    """True if the image's border cuts a ball, whose window is wider than the ball."""
+    return bool(cap[0].any() or cap[-1].any() or cap[:, 0].any() or cap[:, -1].any())
 
 
 def _small(gaps: NDArray[np.uint8], widest_px: float) -> Mask:
@@ -106,12 +113,10 @@ def _small(gaps: NDArray[np.uint8], widest_px: float) -> Mask:
     return np.asarray((gaps > 0) & (sides <= widest_px)[label])
 
 
-def _sectors(mask: Mask, cap: Mask) -> int:
-    """Number of the sectors around a cap's middle that a part of it lies in."""
-    if not mask.any():
-        return 0
-    (v, u), (rows, columns) = np.nonzero(mask), np.nonzero(cap)
-    angle = np.arctan2(v - rows.mean(), u - columns.mean())
+def _sectors(mask: Mask, ray: Image, center: Array) -> int:
+    """Number of the sectors around a ball's middle that a part of it lies in."""
+    away = ray[mask][:, :2] - center[:2] / center[2]
+    angle = np.arctan2(away[:, 1], away[:, 0])
     return len(np.unique(np.floor((angle / np.pi + 1.0) * 0.5 * _SECTORS) % _SECTORS))
 
 
