@@ -73,7 +73,7 @@ class Projector:
 
 @dataclass(frozen=True, slots=True)
 class Interference:
-    """How one unit takes foreign light, whose brightness is given in shares of its own light's."""
+    """Effect on one unit of foreign light, whose brightness is in shares of its own light's."""
 
     lost: float
     """Share of the windows that fail where foreign light is as bright as its own."""
