@@ -24,7 +24,6 @@ Image = NDArray[np.float32]
 BASELINE_M = 0.075
 """Distance of the projector from the camera, along the camera's x axis."""
 
-_WINDOW_PX = 9
 _BLUR_PX = 2.5
 _MOST = 0.6
 """Largest share of lost windows, where foreign light is much the brighter."""
@@ -48,28 +47,33 @@ class Projector:
         return transform(self.world_from_camera, (BASELINE_M, 0.0, 0.0))
 
     def brightness(self, places: Array, outwards: Array) -> Array:
-        """Light (n,) on surfaces at (n, 3) with normals (n, 3), 1 / m^2, by Lambert's law; what
-        stands in between is not looked at."""
+        """Light (n,) on surfaces at (n, 3) with normals (n, 3), 1 / m^2; what stands in between is
+        not looked at."""
         local = transform(invert(self.world_from_camera), places) - (BASELINE_M, 0.0, 0.0)
         K = self.camera.K
         ahead = np.maximum(local[:, 2], 1e-3)
         u = K[0, 0] * local[:, 0] / ahead + K[0, 2]
         v = K[1, 1] * local[:, 1] / ahead + K[1, 2]
         within = (u > 0.0) & (u < self.camera.width) & (v > 0.0) & (v < self.camera.height)
+        return np.where(within & (local[:, 2] > 0.0), self._falling(places, outwards), 0.0)
+
+    def in_shares(self, foreign: Array, places: Array, outwards: Array) -> Image:
+        """Foreign light (n,) on what the sensor's camera sees, in shares of the sensor's own, which
+        reaches to the borders of the camera's image."""
+        own = np.maximum(self._falling(places, outwards), _DIMMEST)
+        return np.asarray(foreign / own, np.float32)
+
+    def _falling(self, places: Array, outwards: Array) -> Array:
+        """Light (n,) by Lambert's law, of a projector that shines in all directions."""
         towards = self.place_m - places
         square = np.einsum("ni,ni->n", towards, towards)
         cosine = np.einsum("ni,ni->n", towards, outwards) / np.sqrt(square)
-        return np.where(within & (local[:, 2] > 0.0), np.maximum(cosine, 0.0) / square, 0.0)
-
-
-def in_shares(foreign: Array, own: Array) -> Image:
-    """Foreign light in shares of a sensor's own."""
-    return np.asarray(foreign / np.maximum(own, _DIMMEST), np.float32)
+        return np.asarray(np.maximum(cosine, 0.0) / square)
 
 
 @dataclass(frozen=True, slots=True)
 class Interference:
-    """Response of one unit to foreign light, whose brightness is in shares of its own light's."""
+    """Effect on one unit of foreign light, whose brightness is in shares of its own light's."""
 
     lost: float
     """Share of the windows that fail where foreign light is as bright as its own."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from station.core.geometry import invert, transform
 from station.core.lens import rays
 from station.core.rig import CameraCalibration
-from station.simulation.interference import BASELINE_M, Projector, in_shares
+from station.simulation.interference import BASELINE_M, Projector
 from station.simulation.noise import Image, TrueView, Window
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ def _foreign(
     pose = camera.world_from_camera
     flat = transform(pose, places.reshape(-1, 3)), normals.reshape(-1, 3) @ pose[:3, :3].T
     total = np.sum([other.brightness(*flat) for other in others], axis=0)
-    return in_shares(total, Projector(camera, pose).brightness(*flat)).reshape(depth_m.shape)
+    return Projector(camera, pose).in_shares(total, *flat).reshape(depth_m.shape)
 
 
 def _bounds(shapes: Array, camera: CameraCalibration) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from station.core.errors import InputError
 from station.core.geometry import rigid, transform
 from station.core.lens import rays as lens_rays
 from station.core.rig import CameraCalibration, Rig
-from station.simulation.interference import BASELINE_M, Projector, in_shares
+from station.simulation.interference import BASELINE_M, Projector
 from station.simulation.noise import Image, TrueView
 
 Array = NDArray[np.float64]
@@ -280,7 +280,7 @@ class VirtualScene:
             reached = light > 0.0
             reached[reached] = self._reached(other.place_m, places[reached] - other.place_m)
             total += np.where(reached, light, 0.0)
-        return in_shares(total, own.brightness(places, outwards))
+        return own.in_shares(total, places, outwards)
 
     def _lit(self, world_from_camera: Array, away: Array) -> NDArray[np.bool_]:
         """Mask of the points (n, 3), from the camera, that its projector beside it reaches."""

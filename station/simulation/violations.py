@@ -139,7 +139,7 @@ _LOST, _WRONG, _NOISE, _LASTING = (0.05, 0.2), (0.05, 0.3), (0.5, 2.0), (0.5, 0.
 
 
 def interference(switches: frozenset[str], seed: int, unit: int) -> Interference | None:
-    """Response of a unit to the others' light, where the booth's sensors disturb each other."""
+    """Effect of the other units' light on one, where the booth's sensors disturb each other."""
     if INTERFERENCE not in switches:
         return None
     rng = _rng(seed, 14, unit)

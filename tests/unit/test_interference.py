@@ -49,6 +49,19 @@ def test_most_of_it_stays_from_frame_to_frame() -> None:
     assert np.mean(second[first]) > 2.0 * np.mean(second)
 
 
+def test_at_the_images_border_the_own_light_is_as_bright_as_beside_it() -> None:
+    """The projector stands beside the camera: a strip of the image, which it lights, was taken for
+    dark, and foreign light for 13 times as bright."""
+    camera = DISTURBED.rig.cameras["front-upper"]
+    wide = box((-4.0, -0.01, 0.0), (4.0, 0.01, 2.1))
+    others = DISTURBED.disturbing("front-upper")
+    view = VirtualScene([wide]).view(camera, camera.world_from_camera, others)
+    assert view.foreign is not None
+    border, beside = (np.median(view.foreign[OVERLAP, u : u + 3]) for u in (0, 50))
+    assert beside > 0.2
+    assert border == pytest.approx(beside, rel=0.4)
+
+
 def test_what_stands_in_the_light_disturbs_nothing_behind_it() -> None:
     shade = box((0.1, -1.45, 0.3), (0.8, -1.44, 1.0))
     assert _lost(_frame(replace(DISTURBED, clutter=[shade])), OVERLAP) < 0.002

@@ -31,6 +31,9 @@ _GAPS = 3
 come so close together a few times in a ball of ten thousand pixels."""
 _SECTORS, _ALL_AROUND = 8, 7
 """Sectors of a ball, and how many of them have gaps that no hand has made."""
+_WIDEST_GAP_M = 0.07
+"""Patches that other sensors' patterns take are smaller; a wider gap is hair or a shadow. Without
+this limit two to four times as many heads were taken for the ball where patterns overlap."""
 _FINGERS_SHOW_M = 1.7
 """Up to this distance a finger is as wide as the averaging window that reveals strays."""
 
@@ -81,25 +84,39 @@ def beside_gaps(
 
     A ball alone is seen whole up to the limit of incidence. Readings are missing at the edges of
     what stands out of it, and these gaps stay where they are when the ball is fitted to the
-    fingers, too, which hides how far they stand out: it has been moved by 5 mm. Gaps all around are
-    no hand's: another sensor's pattern lies over the ball.
+    fingers, too, which hides how far they stand out: it has been moved by 5 mm. Small gaps all
+    around are no hand's: another sensor's pattern lies over the ball. Of a ball that the image's
+    border cuts nobody knows what is all around it.
     """
     cap = ball_image(ray, center, radius)[1] > INCIDENCE_COSINE
     gaps = (cap & (part == 0.0)).astype(np.float32)
     near = cv2.boxFilter(gaps, -1, (_STRAY_BLUR_PX, _STRAY_BLUR_PX), normalize=False)
     several = ((gaps > 0.0) & (near > _GAPS - 0.5)).astype(np.uint8)
-    if _sectors(several > 0, cap) >= _ALL_AROUND:
+    pixels_per_m = camera.K[0, 0] / center[2]
+    small = _small(several, _WIDEST_GAP_M * pixels_per_m)
+    if not _cut(cap) and _sectors(small, ray, center) >= _ALL_AROUND:
         return np.zeros_like(cap)
     apart_px = cv2.distanceTransform(1 - several, cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.asarray(apart_px < _FINGER_M * camera.K[0, 0] / center[2])
+    return np.asarray(apart_px < _FINGER_M * pixels_per_m)
 
 
-def _sectors(mask: Mask, cap: Mask) -> int:
-    """Number of the sectors around a cap's middle that a part of it lies in."""
-    if not mask.any():
-        return 0
-    (v, u), (rows, columns) = np.nonzero(mask), np.nonzero(cap)
-    angle = np.arctan2(v - rows.mean(), u - columns.mean())
+def _cut(cap: Mask) -> bool:
+    """True if the image's border cuts a ball, whose window is wider than the ball."""
+    return bool(cap[0].any() or cap[-1].any() or cap[:, 0].any() or cap[:, -1].any())
+
+
+def _small(gaps: NDArray[np.uint8], widest_px: float) -> Mask:
+    """The gaps that are no wider or higher; those next to each other are one."""
+    joined = cv2.morphologyEx(gaps, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, label, extent, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    sides = extent[:, (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT)].max(axis=1)
+    return np.asarray((gaps > 0) & (sides <= widest_px)[label])
+
+
+def _sectors(mask: Mask, ray: Image, center: Array) -> int:
+    """Number of the sectors around a ball's middle that a part of it lies in."""
+    away = ray[mask][:, :2] - center[:2] / center[2]
+    angle = np.arctan2(away[:, 1], away[:, 0])
     return len(np.unique(np.floor((angle / np.pi + 1.0) * 0.5 * _SECTORS) % _SECTORS))
 
 

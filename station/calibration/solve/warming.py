@@ -75,9 +75,9 @@ def warming_words(changes: Changes) -> str:
     name, change = _alone(changes)
     if abs(change) > _NOISE_ALONE:
         return (
-            f"for girths, fasten camera {name} and let it warm up before the first step: it alone "
-            f"saw the booth {_percent(change)} % {where_words(change)} in one step than in an "
-            "earlier one"
+            f"for girths, fasten camera {name} and let all sensors warm up before the first step: "
+            f"compared with most of the others, it saw the booth {_percent(change)} % "
+            f"{where_words(change)} in one step than in an earlier one"
         )
     return ""
 
@@ -122,9 +122,10 @@ def _too_much(change: float) -> CalibrationError:
 
 def _too_much_alone(name: str, change: float) -> CalibrationError:
     return CalibrationError(
-        f"camera {name} alone saw the booth {_percent(change)} % {where_words(change)} in one step "
-        "than in an earlier one: it was moved, or it warms up or cools down; fasten it, and let it "
-        "warm up for 20 minutes; start again with station calibrate --new"
+        f"camera {name}, compared with most of the others, saw the booth {_percent(change)} % "
+        f"{where_words(change)} in one step than in an earlier one: it was moved, or it warms up "
+        "or cools down; fasten it, and let all sensors warm up for 20 minutes; start again with "
+        "station calibrate --new"
     )
 
 
