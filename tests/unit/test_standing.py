@@ -70,13 +70,19 @@ def test_standing_lines_lie_on_the_scanned_mesh(model: BodyModel) -> None:
     assert ((path >= low) & (path <= high)).all()
 
 
-def test_noisy_readings_widen_the_volume_of_a_standing_body(model: BodyModel) -> None:
+def test_noisy_readings_widen_the_volume_of_a_standing_body(
+    model: BodyModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the gain that was learned; which may be none, since noise averages out in a volume."""
     sigma, state = np.zeros(model.vertex_count), model.neutral_state()
+    volume = replace(shipped()["standard"]["volume"], noise_gain=4.0)
+    learned = {**shipped(), "standard": {**shipped()["standard"], "volume": volume}}
+    monkeypatch.setattr("workers.measure.intervals.shipped", lambda: learned)
     usual, noisy = (
-        float(np.diff(standing.volume_m3.interval95)[0])
-        for standing in (
-            measure_standing(model, model.mean, state, sigma, None, ScanErrors(excess_noise_m=n))
-            for n in (0.0, 2.6e-3)
-        )
+        measure_standing(
+            model, model.mean, state, sigma, None, ScanErrors(excess_noise_m=n)
+        ).volume_m3
+        for n in (0.0, 2.6e-3)
     )
-    assert noisy > 1.02 * usual
+    half = [0.5 * float(np.diff(one.interval95)[0]) / one.value for one in (usual, noisy)]
+    assert np.sqrt(half[1] ** 2 - half[0] ** 2) == pytest.approx(4.0 * 2.6e-3)
