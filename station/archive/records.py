@@ -38,6 +38,7 @@ class ScanRecord:
     finished: str
     """UTC, ISO 8601: when it was delivered or given up; empty before."""
     reasons: tuple[str, ...] = ()
+    """Causes to scan again, or of its failure, and the verdict's remarks."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Duration of each step of the reconstruction."""
 
@@ -83,7 +84,7 @@ def _told(spool: Spool, place: str, scan_id: str, changed: str) -> ScanRecord:
         bundle = {} if "label" in result else _read(spool.path("done", scan_id) / "bundle.json")
         origin = {**bundle, **result}
         state: ScanState = "rescan" if result.get("status") == "rescan" else "delivered"
-        reasons = _reasons(result.get("reasons"))
+        reasons = _reasons(result.get("reasons")) + _reasons(result.get("notes"))
         seconds = _seconds(result.get("seconds"))
     else:
         origin, state, seconds = _read(folder / "bundle.json"), PLACES[place], {}

@@ -14,6 +14,7 @@ from bench_fit import fitted, render
 from bench_measure import Table, measured_in, table_of
 from fit_cases import Case, TestBodies, family_cases, hard_cases
 from fit_report import Row
+from hair import VERDICTS, Hair, with_hair
 from measured_scans import Scan
 from surface_errors import surface_errors
 from true_measurements import TrueBody
@@ -21,9 +22,12 @@ from unlike_bodies import UnlikeBodies
 from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
-from station.simulation.sensor import SimulatedBooth
+from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
-from workers.scape.fit.fit import fit_body
+from workers.measure.body import measure_body
+from workers.reconstruct.job import scan_errors
+from workers.scape.fit.fit import fit_body, fit_overlapping, separate_limbs
+from workers.scape.fit.observer import unobserved
 from workers.scape.model.body_model import BodyModel
 
 BODIES = 2
@@ -93,6 +97,33 @@ def test_bodies_unlike_the_model_keep_the_bars(model: BodyModel, tmp_path: Path)
     table = _table(model, scans)
     assert _girth_error_mm(table) < 10.0
     assert _held(table) > 0.80
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("bun", "hair that stands off the head is left out of the body"),
+        ("thick", "hair or a cap covers the head"),
+        ("ponytail", "hair hides the neck"),
+    ],
+)
+def test_hair_is_no_lost_limb(
+    model: BodyModel, bodies: TestBodies, tmp_path: Path, kind: Hair, words: str
+) -> None:
+    """Each bun was told "rescan", and thick hair made people 2 cm taller to +-2 mm."""
+    usual = bodies.body(1)
+    haired, bundle = with_hair(model, usual, kind), tmp_path / kind
+    scan = preprocess(read_bundle(render_bundle(haired, bundle, SimulatedBooth(seed=4))))
+    fit = fit_overlapping(model, scan, "joint", lambda _step, _share: None, unobserved)
+    verdict = separate_limbs(model, fit, scan.findings, unobserved).verdict
+    assert verdict.status == VERDICTS[kind]
+    assert " ".join((*verdict.reasons, *verdict.notes)).startswith(words)
+    assert verdict.missing == (("neck",) if kind == "ponytail" else ())
+    errors = scan_errors(model, fit, None)
+    rows = measure_body(model, fit.vertices, fit.surface.sigma_m, None, errors).rows
+    height = next(row for row in rows if row.name == "height")
+    low, high = height.interval95_m
+    assert low < np.ptp(usual.vertices[:, 2]) < high
 
 
 def test_nothing_is_lost_unnamed(model: BodyModel, bodies: TestBodies, tmp_path: Path) -> None:

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from station.core.words.tables import Pose
 from workers.measure.body import Content, MeasuredBody, measure_body, measure_standing
 from workers.measure.definitions import DEFINITIONS
-from workers.measure.intervals import ScanErrors, write_shipped
+from workers.measure.intervals import write_shipped
+from workers.measure.scan_errors import ScanErrors
 from workers.reconstruct.job import warm_up
 from workers.scape.model.body_model import BodyModel
 

@@ -22,7 +22,8 @@ from station.simulation.scene import Mesh, astray, default_rig
 from station.simulation.sensor import SimulatedBooth, render_bundle
 from workers.cloud.preprocess import preprocess
 from workers.measure.body import measure_body
-from workers.measure.intervals import RowErrors, content_sigma, line_sigma, sides_pooled
+from workers.measure.intervals import RowErrors, content_sigma, sides_pooled
+from workers.measure.scan_errors import line_sigma
 from workers.measure.standing import standard_turns, stood_upright
 from workers.measure.tracing import trace_all
 from workers.scape.fit.fit import FitResult, fit_body

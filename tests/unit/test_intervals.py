@@ -11,11 +11,12 @@ from workers.measure.intervals import (
     SHIPPED,
     ErrorModel,
     RowErrors,
-    ScanErrors,
     learned,
 )
+from workers.measure.scan_errors import ScanErrors
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.verdict.hair import cover_sigma_m
 
 
 def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:
@@ -94,6 +95,23 @@ def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) 
         half = [0.5 * (one.interval95[1] - one.interval95[0]) for one in (before, after)]
         added = np.sqrt(half[1] ** 2 - half[0] ** 2) / 1.96
         assert added == pytest.approx(getattr(moved, name).value - before.value, rel=0.35), name
+
+
+def test_hair_around_a_head_widens_what_it_makes_larger(model: BodyModel) -> None:
+    """Two centimetres: 2 pi of them to the head's girth, one to the stature, none to the waist."""
+    sigma = np.zeros(model.vertex_count)
+    covered = ScanErrors(cover_sigma_m=cover_sigma_m(model, 0.02))
+    usual, wider = (
+        {
+            row.name: 0.5 * float(np.diff(row.interval95_m)[0])
+            for row in measure_body(model, model.mean, sigma, None, errors).rows
+        }
+        for errors in (ScanErrors(), covered)
+    )
+    added = {name: float(np.sqrt(wider[name] ** 2 - usual[name] ** 2)) for name in usual}
+    assert added["head_girth"] == pytest.approx(2.0 * np.pi * 0.02, rel=0.05)
+    assert added["height"] == pytest.approx(0.02, rel=0.05)
+    assert added["waist_girth"] == 0.0
 
 
 def test_an_interval_holds_its_value() -> None:

@@ -21,7 +21,7 @@ from station.core.kinect_v1 import INDEPENDENT_HZ
 from station.core.rig import PredictedError
 from station.simulation.scene import default_rig
 from workers.export.stopwatch import Stopwatch
-from workers.measure.intervals import ScanErrors
+from workers.measure.scan_errors import ScanErrors
 from workers.reconstruct import job
 from workers.scape.verdict.unmatched import Patch
 
@@ -119,6 +119,7 @@ def test_a_job_tells_the_measurements(
     fit = SimpleNamespace(
         surface=surface,
         crown_sigma_m=3e-3,
+        head_cover_m=0.0,
         patches=patches,
         vertices=np.zeros((3, 3)),
         state=None,

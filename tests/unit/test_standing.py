@@ -8,10 +8,10 @@ from random_bodies import random_body
 
 from workers.measure.body import measure_standing
 from workers.measure.intervals import (
-    ScanErrors,
     shipped,
     sides_pooled,
 )
+from workers.measure.scan_errors import ScanErrors
 from workers.measure.standing import on_both_feet, standard_state, stood_upright
 from workers.measure.tracing import trace_all
 from workers.scape.model.body_model import BodyModel

@@ -10,8 +10,8 @@ from workers.export.origin import Origin
 from workers.export.result import measurements_document
 from workers.measure.body import measure_body
 from workers.measure.coverage import SeenSkin
-from workers.measure.intervals import ScanErrors
 from workers.measure.kinds import TRUNK_ENDS
+from workers.measure.scan_errors import ScanErrors
 from workers.measure.tracing import trace_all
 from workers.scape.model.body_model import BodyModel
 

@@ -12,6 +12,7 @@ from workers.cloud.observed import RAISED_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.model.body_model import FLOOR, BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.verdict.hair import hair_of
 from workers.scape.verdict.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.verdict.seen import PartReport
 from workers.scape.verdict.unmatched import patch_sigma_m, unmatched_patches
@@ -139,7 +140,9 @@ def test_a_head_bent_onto_the_chest_was_not_found(model: BodyModel) -> None:
     assert head_turned(model, _rotations(model, "neck", (-0.4, 0.1, 0.0))) == {}
     lost = head_turned(model, _rotations(model, "neck", (-1.0, 0.3, 0.0)))
     verdict = _verdict(model, {}, {}, lost)
-    assert verdict.reasons == ("the head was not found: look straight ahead",)
+    assert verdict.reasons == (
+        "the head was not found: look straight ahead, with thick hair tied up or covered",
+    )
     assert verdict.missing == ("head",)
 
 
@@ -313,3 +316,31 @@ def test_a_camera_a_few_millimetres_off_is_a_note(model: BodyModel) -> None:
     unusable = _verdict(model, {}, {"front-upper": 0.0052})
     assert unusable.status == "rescan"
     assert unusable.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("around", "told"),
+    [((0.0, 0.13, -0.02), []), ((0.0, -0.09, -0.13), []), ((0.0, 0.09, -0.16), ["neck"])],
+    ids=["bun", "beard", "on the neck"],
+)
+def test_hair_is_told_from_a_lost_head(
+    model: BodyModel, around: tuple[float, float, float], told: list[str]
+) -> None:
+    """A ball of hair of 5 cm beside a head in its place, and beside one that is 5 cm too low."""
+    skin = _scan_of(model, model.mean)
+    head = model.of_parts(("head",))
+    middle = 0.5 * (model.mean[head].min(axis=0) + model.mean[head].max(axis=0))
+    outwards = np.random.default_rng(2).standard_normal((3000, 3))
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    count = len(skin) + len(outwards)
+    cloud = PointCloud(
+        np.concatenate([skin.points, middle + around + 0.05 * outwards]),
+        np.concatenate([skin.normals, outwards]),
+        np.full(count, 1e-3), np.zeros(count, np.int16), ("cloud",),
+    )  # fmt: skip
+    for lower_m, expected in ((0.0, told), (0.05, ["head"])):
+        fitted = model.mean - lower_m * head[:, None] * (0.0, 0.0, 1.0)
+        patches = unmatched_patches(model, fitted, cloud)
+        lost = lost_parts(model, patches, hair_of(model, patches, fitted, cloud))
+        assert set(lost) >= set(expected)
+        assert bool(lost) == bool(expected)

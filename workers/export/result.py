@@ -112,7 +112,11 @@ def _comments(fit: FitResult, origin: Origin) -> list[str]:
 
 def verdict_document(verdict: Verdict) -> dict[str, Any]:
     """Verdict as it stands in the tables and in the glTF files."""
-    return {"status": verdict.status, "reasons": list(verdict.reasons)}
+    return {
+        "status": verdict.status,
+        "reasons": list(verdict.reasons),
+        "notes": list(verdict.notes),
+    }
 
 
 def _shown_rows(measured: MeasuredBody, verdict: Verdict) -> list[Measurement]:

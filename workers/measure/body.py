@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from station.core.words.tables import Pose
 from workers.measure.coverage import Basis, SeenSkin
-from workers.measure.intervals import ScanErrors, content_interval, intervals, row_values
+from workers.measure.intervals import content_interval, intervals, row_values
 from workers.measure.kinds import Route, Top
+from workers.measure.scan_errors import ScanErrors
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
 from workers.scape.model.body_model import FLOOR, BodyModel, BodyState

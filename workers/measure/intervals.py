@@ -35,7 +35,7 @@ from scipy.special import stdtrit
 
 from station.core.errors import FormatError
 from station.core.words.tables import Pose
-from workers.measure.kinds import Definition, Top
+from workers.measure.scan_errors import ScanErrors, line_sigma
 from workers.measure.tracing import Trace
 
 Array = NDArray[np.float64]
@@ -81,59 +81,6 @@ class ErrorModel:
         # What is not a number stays so, unlike in the interpreter's own min and max.
         low, high = np.minimum(value, middle - half), np.maximum(value, middle + half)
         return float(np.maximum(0.0, low)), float(high)
-
-
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """Standard deviations of a body's contents, as shares of them."""
-
-    volume: float
-    surface: float
-
-
-@dataclass(frozen=True, slots=True)
-class ScanErrors:
-    """Standard deviations that concern a whole scan, metres."""
-
-    height_sigma_m: float = 0.0
-    """Heights and lengths, by the calibration's own statement."""
-    girth_sigma_m: float = 0.0
-    """Girths, by the same."""
-    crown_sigma_m: float = 0.0
-    """Top of the head."""
-    excess_noise_m: float = 0.0
-    """The readings' noise, beyond that of ordinary scans. Each row has its own learned gain."""
-    skin_sigma_m: Array | None = None
-    """(P,): the surface beside patches of the scan that it does not explain, and of a head that
-    hair hides. No learned gain applies to it; None for none."""
-
-    def of_contents(self, volume_m3: float, surface_m2: float, height_m: float) -> Contents:
-        """Standard deviations of volume and surface, as shares of them.
-
-        A girth is off by 2 pi times what the skin is moved by, and a skin that moves by d changes
-        the volume V by S d; a cylinder's surface S by S^2 d / 2 V. Heights stretch both.
-        """
-        moved_m = self.girth_sigma_m / (2.0 * np.pi)
-        stretched = self.height_sigma_m / height_m
-        thicker = surface_m2 * moved_m / volume_m3
-        return Contents(
-            float(np.hypot(thicker, stretched)), float(np.hypot(0.5 * thicker, stretched))
-        )
-
-    def of(self, definition: Definition) -> float:
-        """Standard deviation of a row."""
-        if definition.quantity in ("girth", "large girth"):
-            return self.girth_sigma_m
-        if isinstance(definition.kind, Top):
-            return float(np.hypot(self.height_sigma_m, self.crown_sigma_m))
-        return self.height_sigma_m
-
-
-def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
-    """Standard deviation (m) of the surface, rms along a row's line."""
-    tail, head = vertex_sigma_m[trace.points.tail], vertex_sigma_m[trace.points.head]
-    along = tail + trace.points.share * (head - tail)
-    return float(np.sqrt(np.mean(along**2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,9 +245,8 @@ def intervals(
         model = _model_of(trace, pose)
         if pose == "standard":
             model = replace(model, bias=0.0)
-        sigma, further = line_sigma(trace, vertex_sigma_m), scan_errors.of(trace.definition)
-        if scan_errors.skin_sigma_m is not None:
-            further = float(np.hypot(further, line_sigma(trace, scan_errors.skin_sigma_m)))
+        sigma = line_sigma(trace, vertex_sigma_m)
+        further = float(np.hypot(scan_errors.of(trace.definition), scan_errors.of_skin(trace)))
         found.append(model.interval(value, sigma, scan_errors.excess_noise_m, further))
     return found
 

@@ -102,8 +102,8 @@ def fit(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     click.echo(f"{out_folder}: {summary.status}")
-    for reason in summary.reasons:
-        click.echo(f"  {reason}")
+    for words in (*summary.reasons, *summary.notes):
+        click.echo(f"  {words}")
     if not quiet:
         folder = shlex.quote(str(out_folder))
         click.echo(f"its table: reconstruct measure {folder}", err=True)

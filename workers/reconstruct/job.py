@@ -29,7 +29,7 @@ from workers.export.preview import preview, views_of
 from workers.export.result import picture_file, surface_files, write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
-from workers.measure.intervals import ScanErrors
+from workers.measure.scan_errors import ScanErrors
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
     Method,
@@ -45,6 +45,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
 from workers.scape.surface.contours import warm_up as compile_contours
 from workers.scape.surface.uncertainty import hidden_head_sigma
+from workers.scape.verdict.hair import cover_sigma_m
 from workers.scape.verdict.unmatched import patch_sigma_m
 
 Progress = Callable[[str, float], None]
@@ -58,6 +59,7 @@ class JobSummary:
     status: str
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     evidence: Mapping[str, Any] | None = None
     """Document of format "booth-camera-evidence" of a scan that is "ok"."""
 
@@ -181,7 +183,7 @@ def _fitted(
         evidence = overlapping.evidence.document(
             [view.calibration for view in scan.views], origin.calibration
         )
-    return JobSummary(fit.verdict.status, fit.verdict.reasons, evidence)
+    return JobSummary(fit.verdict.status, fit.verdict.reasons, fit.verdict.notes, evidence)
 
 
 def _measuring(
@@ -223,6 +225,7 @@ def scan_errors(
         crown_sigma_m=fit.crown_sigma_m,
         excess_noise_m=fit.cloud.excess_noise_m,
         skin_sigma_m=skin,
+        cover_sigma_m=cover_sigma_m(model, fit.head_cover_m) if fit.head_cover_m else None,
     )
     if predicted is None:
         return replace(errors, height_sigma_m=floor_sigma_m(fit.cloud))

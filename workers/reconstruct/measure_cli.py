@@ -156,10 +156,11 @@ def _contents(document: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]
 
 
 def _heading(document: dict[str, Any]) -> list[tuple[str, str]]:
-    """Lines before any number: the verdict with its reasons, then the scan."""
+    """Lines before any number: the verdict with its reasons and remarks, then the scan."""
     verdict = document.get("verdict") or {}
     lines = [("verdict", verdict["status"])] if verdict else []
     lines += [("reason", reason) for reason in verdict.get("reasons", ())]
+    lines += [("remark", note) for note in verdict.get("notes", ())]
     keys = ("scan_id", "label", "created", "booth", "calibration", "pose")
     return lines + [(key, document[key]) for key in keys if document.get(key)]
 

@@ -132,7 +132,7 @@ class Scan(BaseModel):
     state: State
     verdict: Literal["", "ok", "rescan", "failed"]
     may_leave: bool = Field(description="the scan is on disk: the person may leave")
-    reasons: list[str]
+    reasons: list[str] = Field(description="the verdict's reasons, then its remarks")
     created: str = Field(description="ISO 8601, UTC")
     finished: str
     seconds: dict[str, float] = Field(description="duration of each step of the reconstruction")

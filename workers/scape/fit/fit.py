@@ -31,6 +31,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.halves import started
 from workers.scape.surface.displacement import SurfaceFit, fit_surface
 from workers.scape.surface.intersections import untangled
+from workers.scape.verdict.hair import hair_of, head_cover_m
 from workers.scape.verdict.posture import (
     arms_inside,
     feet_cut_off,
@@ -41,7 +42,7 @@ from workers.scape.verdict.posture import (
 )
 from workers.scape.verdict.seen import PartReport, report_parts, sides_seen, unexplained_share
 from workers.scape.verdict.unmatched import Patch, unmatched_patches
-from workers.scape.verdict.verdict import Verdict, judge, lost_parts
+from workers.scape.verdict.verdict import Verdict, hair_remarks, judge, lost_parts
 
 Array = NDArray[np.float64]
 Method = Literal["joint", "paper"]
@@ -108,6 +109,8 @@ class OverlappingFit:
     separated."""
     crown_sigma_m: float
     """Standard deviation of the top of the head, in excess of an ordinary scan's."""
+    head_cover_m: float
+    """Thickness at most (95 %) of hair or a cap all around the head."""
     patches: Future[tuple[Patch, ...]]
     """Patches of the scan that the surface does not explain, which are searched for meanwhile."""
     cloud: PointCloud
@@ -189,6 +192,7 @@ def fit_overlapping(
         surface=surface,
         reference=reference,
         crown_sigma_m=crown_sigma,
+        head_cover_m=head_cover_m(model, surface.vertices, reference, state.rotations),
         # Only intervals and verdict need these: whoever separates limbs does not wait for them.
         patches=started(unmatched_patches, model, surface.vertices, cloud),
         cloud=cloud,
@@ -235,11 +239,13 @@ def separate_limbs(
             noticed += off_floor(model, fit.reference)
         misplaced |= feet_cut_off(model, vertices, fit.cloud.points)
         misplaced |= head_cut_off(model, surface.seen, fit.crown_sigma_m)
-    lost = lost_parts(model, fit.patches.result())
+    patches = fit.patches.result()
+    hair = hair_of(model, patches, fit.surface.vertices, fit.cloud)
+    lost, remarks = lost_parts(model, patches, hair), hair_remarks(hair, fit.head_cover_m)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)
     beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced)
+    verdict = judge(parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced, remarks)
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

@@ -13,6 +13,7 @@ from workers.scape.evidence.crown import FACE_ALONE_M
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.model.body_model import HAND, BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.verdict.hair import BROW_LEVELS, NAPE_LEVELS, zone_of_head
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,9 +41,6 @@ _BROW_SEEN, _NAPE_SEEN = 0.6, 0.4
 """Share of the brow that was seen at least, and of the back of the head below it at most, if dark
 hair hides the top: 0.75 and 0.13 on three bodies. Where 14 cm or more of a head are cut off,
 heights are up to 44 mm off, and the brow has at most 0.47 or the back at least 0.5."""
-_BROW_LEVELS, _NAPE_LEVELS, _SIDEWAYS = (0.58, 0.70), (0.25, 0.6), 0.5
-"""Levels of both, as shares of the head's height, and the least component of their normals to the
-front or the back."""
 _TOES_SHARE, _UPWARDS = 0.35, 0.5
 """Share of a foot's length that its toes are, and the least z component of its upper side's
 normals."""
@@ -73,7 +71,9 @@ def head_turned(model: BodyModel, rotations: Array) -> dict[str, str]:
     chest, head = (rotations[model.part_names.index(part)] for part in ("chest", "head"))
     if np.linalg.norm(so3_log(chest.T @ head)) < _HEAD_TURN_RAD:
         return {}
-    return {"head": "the head was not found: look straight ahead"}
+    return {
+        "head": "the head was not found: look straight ahead, with thick hair tied up or covered"
+    }
 
 
 def feet_cut_off(model: BodyModel, vertices: Array, points: Array) -> dict[str, str]:
@@ -132,16 +132,8 @@ def head_cut_off(model: BodyModel, seen: Mask, crown_sigma_m: float) -> dict[str
     """
     if crown_sigma_m < FACE_ALONE_M:
         return {}
-    head = model.of_parts(("head",))
-    height = model.mean[:, 2]
-    level = (height - height[head].min()) / np.ptp(height[head])
-    ahead = -vertex_normals(model.mean, model.faces)[:, 1]
-
-    def share(levels: tuple[float, float], side: float) -> float:
-        there = head & (side * ahead > _SIDEWAYS) & (level > levels[0]) & (level < levels[1])
-        return float(seen[there].mean())
-
-    if share(_BROW_LEVELS, 1.0) > _BROW_SEEN and share(_NAPE_LEVELS, -1.0) < _NAPE_SEEN:
+    brow, nape = zone_of_head(model, BROW_LEVELS, 1.0), zone_of_head(model, NAPE_LEVELS, -1.0)
+    if seen[brow].mean() > _BROW_SEEN and seen[nape].mean() < _NAPE_SEEN:
         return {}
     return {"head": "the top of the head was not seen: scan the person up to it"}
 

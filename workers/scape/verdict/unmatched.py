@@ -37,7 +37,7 @@ _WIDENED_RINGS = 3
 """Rings of vertices around those next to a patch, whose points are thinned."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Patch:
     """Connected part of the scan that lies farther than 15 mm from the surface."""
 

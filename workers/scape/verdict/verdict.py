@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from station.core.words.terms import part_in_words
 from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
+from workers.scape.verdict.hair import Hair
 from workers.scape.verdict.seen import TRUNK, PartReport, named_parts
 from workers.scape.verdict.seen_words import little_seen, many_hardly_seen
 from workers.scape.verdict.unmatched import ELSEWHERE_M, Patch
@@ -57,6 +58,7 @@ _SCATTER_M = 0.006
 """Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
 sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
 _NO_BODY = "too much of the scan does not match a body: nothing can be measured"
+_HEAD_REMEDY = "tie up or cover hair that stands off the head"
 _ON_ITS_HEAD = "if the cloud stands on its head, say which axis points up (--up)"
 _NONE: Mapping[str, str] = MappingProxyType({})
 
@@ -69,7 +71,7 @@ class Verdict:
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    """Remarks on the booth that do not touch this scan."""
+    """Remarks, which do not ask for another scan: on hair, and on cameras that moved a little."""
     missing: tuple[str, ...] = ()
     """Parts that were not seen or that do not match the scan: nothing can be measured there. A hand
     stands for its thumb and fingers; `FLOOR` is one of them."""
@@ -95,6 +97,7 @@ def judge(
     camera_shifts_m: dict[str, float],
     rms_m: float,
     misplaced: Mapping[str, str] = _NONE,
+    remarks: Sequence[str] = (),
 ) -> Verdict:
     """Decide whether to scan again.
 
@@ -106,10 +109,11 @@ def judge(
         camera_shifts_m: how far the fit moved each camera's points; empty for a bare cloud.
         rms_m: distance of the points from the surface.
         misplaced: what `head_turned`, `arms_inside`, `feet_cut_off` and `head_cut_off` give.
+        remarks: what `hair_remarks` gives; told with a scan that can be used.
     """
     cameras = bool(camera_shifts_m)
     unseen = _unseen_parts(parts, cameras=cameras)
-    moved, notes = _moved_cameras(camera_shifts_m)
+    moved, of_cameras = _moved_cameras(camera_shifts_m)
     halves = _unseen_sides(sides, cameras=cameras)
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
@@ -136,6 +140,7 @@ def judge(
         remedy = "run: station check" if cameras else "clean the cloud, or scan again"
         reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
     again = bool(reasons)
+    notes = of_cameras if again else [*remarks, *of_cameras]
     missing = _missing(
         parts, findings, lost, unseen, halves, cameras=cameras, again=again, everywhere=everywhere
     )
@@ -188,12 +193,35 @@ def _moved_cameras(shifts_m: Mapping[str, float]) -> tuple[list[str], list[str]]
     return reasons, notes
 
 
-def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
-    """Reasons by the part that a large patch of the scan belongs to; "" where it is none."""
+def hair_remarks(hair: Hair, cover_m: float) -> list[str]:
+    """Remarks on hair beside the head, and on what covers it (`head_cover_m`)."""
+    remarks = []
+    if any(patch.area_m2 > _LOST_PATCH_M2 for patch in hair.on_head):
+        remarks.append("hair that stands off the head is left out of the body")
+    if cover_m > 0.0:
+        remarks.append(
+            f"hair or a cap covers the head, up to {1e3 * cover_m:.0f} mm thick: height and head "
+            "are measured with it; cover hair with a close-fitting cap if they matter"
+        )
+    return remarks
+
+
+def lost_parts(
+    model: BodyModel, patches: Sequence[Patch], hair: Hair | None = None
+) -> dict[str, str]:
+    """Reasons by the part that a large patch of the scan belongs to; "" where it is none.
+
+    Args:
+        hair: those of the patches that are hair.
+    """
+    hair = hair or Hair()
     keys = {index: key for key, members in named_parts(model).items() for index in members}
     reasons: dict[str, str] = {}
     for patch in patches:
-        if patch.area_m2 < _LOST_PATCH_M2:
+        if patch.area_m2 < _LOST_PATCH_M2 or patch in hair.on_head:
+            continue
+        if patch in hair.hanging:
+            reasons.setdefault("neck", "hair hides the neck: tie it up, off neck and shoulders")
             continue
         size = f"{1e4 * patch.area_m2:.0f} cm2"
         if patch.distance_m > ELSEWHERE_M:
@@ -205,11 +233,11 @@ def lost_parts(model: BodyModel, patches: Sequence[Patch]) -> dict[str, str]:
             continue
         for index in patch.parts:
             part = keys[index]
-            reasons.setdefault(
-                part,
+            reason = (
                 f"the {part_in_words(part)} does not match the scan ({size} of it lie "
-                f"{1e3 * patch.distance_m:.0f} mm away)",
+                f"{1e3 * patch.distance_m:.0f} mm away)"
             )
+            reasons.setdefault(part, f"{reason}; {_HEAD_REMEDY}" if part == "head" else reason)
     return reasons
 
 
