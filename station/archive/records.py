@@ -23,6 +23,7 @@ PLACES: dict[str, ScanState] = {
 """Folder of the spool -> state; a result in the outbox may also ask for another scan. In the order
 in which a scan passes them: if a scan is in two, the later one counts."""
 _UNREADABLE = "its files cannot be read"
+_DAMAGED = "its result.json is missing or damaged; scan again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +84,12 @@ def _told(spool: Spool, place: str, scan_id: str, changed: str) -> ScanRecord:
         # Results of earlier versions have no label; their bundle has, while it is kept.
         bundle = {} if "label" in result else _read(spool.path("done", scan_id) / "bundle.json")
         origin = {**bundle, **result}
-        state: ScanState = "rescan" if result.get("status") == "rescan" else "delivered"
-        reasons = _reasons(result.get("reasons")) + _reasons(result.get("notes"))
+        known = result.get("status") in ("ok", "rescan")
+        state: ScanState = "delivered" if result.get("status") == "ok" else "rescan"
+        words = _reasons(result.get("reasons")) + _reasons(result.get("notes"))
+        reasons = words if known else (_DAMAGED,)
+        if not known and "label" not in origin and (note := spool.notes.read(ScanId(scan_id))):
+            origin["label"] = note.label
         seconds = _seconds(result.get("seconds"))
     else:
         origin, state, seconds = _read(folder / "bundle.json"), PLACES[place], {}

@@ -229,8 +229,9 @@ def deliver(config_path: Path | None, now: bool) -> None:
         waiting = Counter(entry.target for entry in Ledger(config.spool.folder).try_now(names))
         for name in names:
             click.echo(f"deliver {name}: {waiting[name] or 'nothing'} to hand over")
-        if waiting and not anything_runs(config.runtime.folder):
-            click.echo(NOTHING_RUNS)
+        if waiting:
+            runs = anything_runs(config.runtime.folder)
+            click.echo("being tried; station status shows what fails" if runs else NOTHING_RUNS)
         return
     with only_process(config.runtime.folder, "deliver") as log:
         HandOver(config, log).run(stop_event())

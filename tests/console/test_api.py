@@ -142,6 +142,20 @@ def test_a_countdown_can_be_cancelled(console: LiveConsole) -> None:
         assert (gone["state"], gone["reasons"]) == ("failed", ["cancelled by the operator"])
 
 
+def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole) -> None:
+    """Whoever deleted it was told that there was no such scan, and then it was taken."""
+    with console.sensors(), console.client() as client:
+        scan = client.post("/scans", json={"label": "Order\u3000 8", "countdown_s": 20}).json()
+        try:
+            for path in (f"/scans/{scan['scan_id']}", "/scans?label=Order 8"):
+                told = _problem(client.delete(path), 409, "not-possible")
+                assert "is being taken; try again when it is done" in told["detail"]
+            _problem(client.delete("/scans?label=Order"), 404, "no-such-scan")
+        finally:
+            client.post(f"/scans/{scan['scan_id']}/cancel")
+        _problem(client.delete("/scans?label=Order 8"), 404, "no-such-scan")
+
+
 def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) -> None:
     assert scans
     done = console.scan("to be deleted")

@@ -5,6 +5,8 @@ import json
 import pytest
 from click.testing import CliRunner
 
+from station.archive.phrases import in_language
+from station.archive.records import read_record
 from station.cli import station
 from station.core.files import write_json
 from station.core.scans import CANCELLED, REASON, ScanId, ScanNote
@@ -30,6 +32,22 @@ def test_one_damaged_scan_does_not_hide_the_others(
         (folder / name).write_text(_ODD[odd])
     listed = CliRunner().invoke(station, ["list", *option])
     assert (listed.exit_code, len(listed.output.splitlines())) == (0, 5)
+
+
+@pytest.mark.parametrize("torn", [None, "", '{"status": "o', '{"reasons": []}'])
+def test_a_result_whose_verdict_is_lost_is_not_usable(spool: Spool, torn: str | None) -> None:
+    """It was listed, and handed over, as usable."""
+    scan_id = ScanId("20261125T100000Z-0005")
+    folder = spool.path("outbox", scan_id)
+    folder.mkdir()
+    if torn is not None:
+        (folder / "result.json").write_text(torn)
+    spool.notes.write(ScanNote(scan_id, "delivered", label="7", verdict="ok"), durable=False)
+    found = read_record(spool, "outbox", scan_id)
+    assert found is not None
+    assert (found.state, found.label) == ("rescan", "7")
+    assert found.reasons == ("its result.json is missing or damaged; scan again",)
+    assert "缺失" in in_language(found.reasons[0], "zh")
 
 
 def test_list_and_find_on_the_command_line(option: list[str]) -> None:

@@ -50,7 +50,7 @@ def test_the_api_tells_of_a_scan_whose_result_was_taken_away(
     config = load_config(Path(option[1]))
     audit = SimpleNamespace(note=lambda *words: noted.append(words[2:]))
     noted: list[Any] = []
-    waiting = SimpleNamespace(status=lambda _: None)
+    waiting = SimpleNamespace(status=lambda _: None, counting=dict)
     told: Any = SimpleNamespace(
         spool=spool, index=ScanIndex(spool), ledger=Ledger(spool.folder), countdown=waiting,
         config=config, audit=audit,

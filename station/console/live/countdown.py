@@ -66,6 +66,11 @@ class ScanCountdown:
         with self._lock:
             return self._document(scan_id) if scan_id in self._waiting else None
 
+    def counting(self) -> dict[str, str]:
+        """The scan whose countdown runs, if any, with its label."""
+        with self._lock:
+            return {one: w.label for one, w in self._waiting.items() if w.state == "countdown"}
+
     def cancel(self, scan_id: str) -> dict[str, Any]:
         """Cancel a scan.
 

@@ -55,7 +55,7 @@ def reconstruct_bundle(bundle: Path, out: Path, **rest: Any) -> Any:
 
 def _write_empty_tables(out: Path, scan_id: str) -> None:
     """As much of a result as the console and the hand-over read."""
-    (out / "result.json").write_text(json.dumps({"scan_id": scan_id}))
+    (out / "result.json").write_text(json.dumps({"scan_id": scan_id, "status": "ok"}))
     for pose, name in FILES.items():
         table = {"format": "booth-measurements", "version": 1, "pose": pose, "measurements": []}
         (out / name).write_text(json.dumps(table))
