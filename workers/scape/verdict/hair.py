@@ -49,8 +49,9 @@ _LARGEST_GIRTH_M = 0.645
 _BEYOND_MODEL_M = 0.0065
 """Girth of the surface beyond the model's own from which a head is covered: -6 to 4.2 mm in 136
 scans of the family and of sculpted bodies, 9 to 56 where 1 to 3 cm of hair cover it."""
-
-
+_ALL_AROUND_M = 0.006
+"""The same by the median distance between both beside and behind the forehead: 7 to 84 mm with such
+hair, at most 5.5 with buns, 3.2 with ponytails on sculpted bodies."""
 _NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval over the standard deviation of a normal distribution."""
 
@@ -141,8 +142,14 @@ def head_cover_m(
         return float(ConvexHull(surface[brow] @ level_of_head).area)
 
     girth = girth_m(vertices)
-    beyond = 0.0 if reference is None else girth - girth_m(reference)
-    if girth < _LARGEST_GIRTH_M and beyond < _BEYOND_MODEL_M:
+    covered = girth > _LARGEST_GIRTH_M
+    if not covered and reference is not None and girth - girth_m(reference) > _BEYOND_MODEL_M:
+        # A bun makes one side larger, hair all of it but the forehead.
+        normals = vertex_normals(reference, model.faces)
+        out_m = np.einsum("ni,ni->n", vertices - reference, normals)
+        hairy = brow & ~zone_of_head(model, BROW_LEVELS, 1.0)
+        covered = 2.0 * np.pi * float(np.median(out_m[hairy])) > _ALL_AROUND_M
+    if not covered:
         return 0.0
     smallest = _HEAD_GIRTH_M - 2.0 * _HEAD_GIRTH_SIGMA_M
     return max(0.0, girth - smallest) / (2.0 * np.pi * _HAIRY_SHARE)
