@@ -102,9 +102,9 @@ def test_bodies_unlike_the_model_keep_the_bars(model: BodyModel, tmp_path: Path)
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("bun", "hair that stands off the head is left out of the body"),
+        ("bun", "hair or something worn that stands off the head is left out of the body"),
         ("thick", "hair or a cap covers the head"),
-        ("ponytail", "hair hides the neck"),
+        ("ponytail", "hair or something worn hides the neck"),
     ],
 )
 def test_hair_is_no_lost_limb(

@@ -145,6 +145,7 @@ def test_what_is_documented_is_valid(name: str) -> None:
         ("result", {"reasons": ["the cameras saw only 5 % of the left forearm"]}),
         ("result", {"label": 7}),
         ("measurements", {"verdict": {"status": "perhaps", "reasons": []}}),
+        ("measurements", {"verdict": {"status": "ok", "reasons": [], "notes": "hair"}}),
         ("result", {"files": {"mesh.ply": SHA}}),
         ("result", {"translation": [0.0, 0.0]}),
         ("measurements", {"pose": "sitting"}),

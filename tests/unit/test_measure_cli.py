@@ -118,6 +118,7 @@ def test_what_cannot_be_measured_is_refused_with_a_remedy(model: BodyModel, tmp_
         ("differences", [{"name": "arm", "value_m": None, "interval95_m": None}]),
         ("volume_m3", {"value": float("nan"), "interval95": [0.0, 1.0]}),
         ("verdict", "ok"),
+        ("verdict", {"status": "ok", "notes": "hair"}),
         ("label", 5),
     ],
 )

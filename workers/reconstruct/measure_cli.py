@@ -114,6 +114,7 @@ class _Content(BaseModel):
 class _Verdict(BaseModel):
     status: str
     reasons: list[str] = []
+    notes: list[str] = []
 
 
 class _Document(BaseModel):

@@ -211,7 +211,7 @@ class Part(BaseModel):
     name: str
     coverage: float
     residual_rms_m: float | None
-    doubtful: bool = Field(description="whether the verdict's reasons name it")
+    doubtful: bool = Field(description="whether the verdict's reasons or remarks name it")
 
 
 class Quality(BaseModel):

@@ -31,7 +31,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.halves import started
 from workers.scape.surface.displacement import SurfaceFit, fit_surface
 from workers.scape.surface.intersections import untangled
-from workers.scape.verdict.hair import hair_of, head_cover_m
+from workers.scape.verdict.hair import Hair, hair_of, head_cover_m
 from workers.scape.verdict.posture import (
     arms_inside,
     feet_cut_off,
@@ -233,14 +233,16 @@ def separate_limbs(
     parts, rms_m = report_parts(model, vertices, surface.seen, fit.cloud)
     rotations = fit.state.rotations
     noticed = [*findings, *leaning(model, rotations)]
-    misplaced = {**head_turned(model, rotations), **arms_inside(model, fit.vertices)}
+    arms = arms_inside(model, fit.vertices)
+    misplaced = {**head_turned(model, rotations), **arms}
     if not fit.camera_shifts_m:
         if fit.reference is not None:
             noticed += off_floor(model, fit.reference)
         misplaced |= feet_cut_off(model, vertices, fit.cloud.points)
         misplaced |= head_cut_off(model, surface.seen, fit.crown_sigma_m)
     patches = fit.patches.result()
-    hair = hair_of(model, patches, fit.surface.vertices, fit.cloud)
+    # What lies beside the head may be an arm that was not found.
+    hair = Hair() if arms else hair_of(model, patches, fit.surface.vertices, fit.cloud)
     lost, remarks = lost_parts(model, patches, hair), hair_remarks(hair, fit.head_cover_m)
     stature_m = float(np.ptp(vertices[:, 2]))
     sides = sides_seen(model, vertices, surface.seen)

@@ -37,6 +37,9 @@ _NEXT_TO_HEAD = ("head", "neck", "chest", "shoulder_left", "shoulder_right")
 """Parts that hair lies on."""
 _FARTHEST_M = 0.09
 """Distance of a patch from which it is not hair: a bun's is 74 mm at most."""
+_LARGEST_M2 = 0.04
+"""Area of a patch from which it is not hair: long hair has 330 cm^2, an arm beside the head that
+the fit lost 430 to 1,890."""
 _HEAD_GIRTH_M, _HEAD_GIRTH_SIGMA_M = 0.567, 0.020
 """Mean and spread of the girth at the brow. Of 6,068 people (ANSUR II, 2012) the head's girth has
 570 and 18 mm, of the model's own family 567 and 20."""
@@ -91,6 +94,7 @@ def hair_of(model: BodyModel, patches: Sequence[Patch], vertices: Array, cloud: 
         for patch in patches
         if parts.issuperset(patch.parts)
         and patch.distance_m < _FARTHEST_M
+        and patch.area_m2 < _LARGEST_M2
         and np.isin(model.part_of_vertex[patch.vertices], (head, neck)).any()
     ]
     if not beside or not _has_face(model, vertices, cloud):
@@ -103,7 +107,10 @@ def hair_of(model: BodyModel, patches: Sequence[Patch], vertices: Array, cloud: 
 
 
 def _is_beard(model: BodyModel, patch: Patch) -> bool:
-    """Whether all skin next to a patch is in front and below the face: long hair lies beside it."""
+    """Whether a patch begins at the head, and all skin next to it is in front and below the face:
+    long hair lies beside it, straps begin at the neck."""
+    if model.part_names.index("head") not in patch.parts:
+        return False
     ahead = -vertex_normals(model.mean, model.faces)[patch.vertices, 1]
     across = np.abs(model.mean[patch.vertices, 0])
     return bool(ahead.mean() > 0.0 and across.max() < _BESIDE_FACE_M)

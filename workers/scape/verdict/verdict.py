@@ -59,6 +59,7 @@ _SCATTER_M = 0.006
 sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
 _NO_BODY = "too much of the scan does not match a body: nothing can be measured"
 _HEAD_REMEDY = "tie up or cover hair that stands off the head"
+_NECK_HIDDEN = "hair or something worn hides the neck: tie hair up, take scarves and straps off"
 _ON_ITS_HEAD = "if the cloud stands on its head, say which axis points up (--up)"
 _NONE: Mapping[str, str] = MappingProxyType({})
 
@@ -197,7 +198,7 @@ def hair_remarks(hair: Hair, cover_m: float) -> list[str]:
     """Remarks on hair beside the head, and on what covers it (`head_cover_m`)."""
     remarks = []
     if any(patch.area_m2 > _LOST_PATCH_M2 for patch in hair.on_head):
-        remarks.append("hair that stands off the head is left out of the body")
+        remarks.append("hair or something worn that stands off the head is left out of the body")
     if cover_m > 0.0:
         remarks.append(
             f"hair or a cap covers the head, up to {1e3 * cover_m:.0f} mm thick: height and head "
@@ -221,7 +222,7 @@ def lost_parts(
         if patch.area_m2 < _LOST_PATCH_M2 or patch in hair.on_head:
             continue
         if patch in hair.hanging:
-            reasons.setdefault("neck", "hair hides the neck: tie it up, off neck and shoulders")
+            reasons.setdefault("neck", _NECK_HIDDEN)
             continue
         size = f"{1e4 * patch.area_m2:.0f} cm2"
         if patch.distance_m > ELSEWHERE_M:
