@@ -121,16 +121,22 @@ def false_rescans(studio: Studio, bodies: int) -> tuple[int, int]:
     return scans, wrong
 
 
+def _rendered(mesh: Mesh, stem: Path, seed: int) -> Path:
+    """The bundle of a scan, rendered if it was not before."""
+    digest = hashlib.sha256(mesh.vertices.tobytes()).hexdigest()[:12]
+    bundle = stem.with_name(f"{stem.name}-{digest}")
+    if not bundle.exists():
+        render_bundle(mesh, bundle, SimulatedBooth(seed=seed))
+    return bundle
+
+
 def unnamed_losses(model: BodyModel, bodies: int, folder: Path) -> tuple[int, int, int, int]:
     """Bad scans, those with lost limbs, those with one that is not named, and rescans."""
     database = BodyDatabase()
     scans = losses = unnamed = rescans = 0
     for scan in bad_scans(model, database, bodies):
-        digest = hashlib.sha256(scan.body.tobytes()).hexdigest()[:12]
-        bundle = folder / f"bad-{scan.name.replace(' ', '-')}-{digest}"
-        if not bundle.exists():
-            mesh = Mesh(scan.body, database.faces, scan.dark)
-            render_bundle(mesh, bundle, SimulatedBooth(seed=900 + scans))
+        mesh = Mesh(scan.body, database.faces, scan.dark)
+        bundle = _rendered(mesh, folder / f"bad-{scan.name.replace(' ', '-')}", 900 + scans)
         scans += 1
         try:
             fit = fit_body(model, preprocess(read_bundle(bundle)))
@@ -158,10 +164,7 @@ def hair_misjudged(model: BodyModel, bodies: int, folder: Path) -> tuple[int, in
     for index, usual in enumerate(TestBodies().body(index) for index in range(bodies)):
         for kind, expected in VERDICTS.items():
             haired = with_hair(model, usual, kind)
-            digest = hashlib.sha256(haired.vertices.tobytes()).hexdigest()[:12]
-            bundle = folder / f"hair-{kind}-{index:02d}-{digest}"
-            if not bundle.exists():
-                render_bundle(haired, bundle, SimulatedBooth(seed=700 + index))
+            bundle = _rendered(haired, folder / f"hair-{kind}-{index:02d}", 700 + index)
             verdict = fit_body(model, preprocess(read_bundle(bundle))).verdict
             scans += 1
             wrong += verdict.status != expected

@@ -13,10 +13,9 @@ from workers.measure.intervals import (
     RowErrors,
     learned,
 )
-from workers.measure.scan_errors import ScanErrors
+from workers.measure.scan_errors import ScanErrors, cover_sigma_m
 from workers.scape.model.body_model import BodyModel
 from workers.scape.model.deformation import vertex_normals
-from workers.scape.verdict.hair import cover_sigma_m
 
 
 def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:

@@ -111,7 +111,7 @@ def _comments(fit: FitResult, origin: Origin) -> list[str]:
 
 
 def verdict_document(verdict: Verdict) -> dict[str, Any]:
-    """Verdict as it stands in the tables and in the glTF files."""
+    """Verdict as it stands in the result, the tables and the glTF files."""
     return {
         "status": verdict.status,
         "reasons": list(verdict.reasons),
@@ -191,9 +191,7 @@ def result_document(
         "format": "booth-result",
         "version": 1,
         **origin.to_json(),
-        "status": fit.verdict.status,
-        "reasons": list(fit.verdict.reasons),
-        "notes": list(fit.verdict.notes),
+        **verdict_document(fit.verdict),
         "method": method,
         "model": {"name": model.name, "sha256": model.sha256},
         "shape": fit.state.beta.tolist(),

@@ -35,7 +35,7 @@ from scipy.special import stdtrit
 
 from station.core.errors import FormatError
 from station.core.words.tables import Pose
-from workers.measure.scan_errors import ScanErrors, line_sigma
+from workers.measure.scan_errors import NORMAL_QUANTILE, ScanErrors, line_sigma
 from workers.measure.tracing import Trace
 
 Array = NDArray[np.float64]
@@ -44,8 +44,6 @@ FORMAT = "booth-intervals"
 VERSION = 2
 SHIPPED = "data/intervals.json"
 COVERAGE = 0.95
-_NORMAL_QUANTILE = 1.96
-"""Half width of a 95 % interval over the standard deviation of a normal distribution."""
 _MIN_CONSTANT = 0.7
 """Floor of the constant, as a share of what it is without the family's own sigmas: an ordinary scan
 with none of them is no better than that."""
@@ -76,7 +74,7 @@ class ErrorModel:
             further: standard deviation that concerns the whole scan.
         """
         parts = (self.constant, self.gain * sigma, self.noise_gain * noise)
-        half = float(np.linalg.norm((*parts, _NORMAL_QUANTILE * further)))
+        half = float(np.linalg.norm((*parts, NORMAL_QUANTILE * further)))
         middle = value - self.bias
         # What is not a number stays so, unlike in the interpreter's own min and max.
         low, high = np.minimum(value, middle - half), np.maximum(value, middle + half)

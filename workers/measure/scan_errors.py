@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from workers.measure.kinds import Definition, Top
 from workers.measure.tracing import Trace
+from workers.scape.model.body_model import BodyModel
 
 Array = NDArray[np.float64]
 
+NORMAL_QUANTILE = 1.96
+"""Half width of a 95 % interval over the standard deviation of a normal distribution."""
 _GIRTHS = ("girth", "large girth")
 _COVERED_M2 = 0.08
 """Area of a head that hair covers."""
@@ -88,3 +91,8 @@ def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
     tail, head = vertex_sigma_m[trace.points.tail], vertex_sigma_m[trace.points.head]
     along = tail + trace.points.share * (head - tail)
     return float(np.sqrt(np.mean(along**2)))
+
+
+def cover_sigma_m(model: BodyModel, thickness_m: float) -> Array:
+    """Standard deviations (P,) of the skin of a head under a cover of at most (95 %) so much."""
+    return np.where(model.of_parts(("head",)), thickness_m / NORMAL_QUANTILE, 0.0)

@@ -29,7 +29,7 @@ from workers.export.preview import preview, views_of
 from workers.export.result import picture_file, surface_files, write_result
 from workers.export.stopwatch import Stopwatch
 from workers.measure.body import MeasuredBody, measure_body, measure_standing
-from workers.measure.scan_errors import ScanErrors
+from workers.measure.scan_errors import ScanErrors, cover_sigma_m
 from workers.scape.evidence.cameras import CameraCorrections
 from workers.scape.fit.fit import (
     Method,
@@ -45,7 +45,6 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.skeleton import joint_positions
 from workers.scape.surface.contours import warm_up as compile_contours
 from workers.scape.surface.uncertainty import hidden_head_sigma
-from workers.scape.verdict.hair import cover_sigma_m
 from workers.scape.verdict.unmatched import patch_sigma_m
 
 Progress = Callable[[str, float], None]

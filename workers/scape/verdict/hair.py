@@ -55,8 +55,6 @@ scans of the family and of sculpted bodies, 9 to 56 where 1 to 3 cm of hair cove
 _ALL_AROUND_M = 0.006
 """The same by the median distance between both beside and behind the forehead: 7 to 84 mm with such
 hair, at most 5.5 with buns, 3.2 with ponytails on sculpted bodies."""
-_NORMAL_QUANTILE = 1.96
-"""Half width of a 95 % interval over the standard deviation of a normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +97,8 @@ def hair_of(model: BodyModel, patches: Sequence[Patch], vertices: Array, cloud: 
     ]
     if not beside or not _has_face(model, vertices, cloud):
         return Hair()
-    stays = [patch.parts == (head,) or _is_beard(model, patch) for patch in beside]
-    return Hair(
-        on_head=tuple(patch for patch, there in zip(beside, stays, strict=True) if there),
-        hanging=tuple(patch for patch, there in zip(beside, stays, strict=True) if not there),
-    )
+    on_head = tuple(p for p in beside if p.parts == (head,) or _is_beard(model, p))
+    return Hair(on_head, hanging=tuple(p for p in beside if p not in on_head))
 
 
 def _is_beard(model: BodyModel, patch: Patch) -> bool:
@@ -160,8 +155,3 @@ def head_cover_m(
         return 0.0
     smallest = _HEAD_GIRTH_M - 2.0 * _HEAD_GIRTH_SIGMA_M
     return max(0.0, girth - smallest) / (2.0 * np.pi * _HAIRY_SHARE)
-
-
-def cover_sigma_m(model: BodyModel, thickness_m: float) -> Array:
-    """Standard deviations (P,) of the skin of a head under a cover of at most (95 %) so much."""
-    return np.where(model.of_parts(("head",)), thickness_m / _NORMAL_QUANTILE, 0.0)
