@@ -21,6 +21,7 @@ from station.core.scans import STATES, Notes, ScanId, boot_id, plain_label, scan
 from station.core.service import set_up_logs
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
+from station.messaging.countdowns import counting_down
 
 _OF_OTHERS = ("cameras", "handover")
 """Folders of the spool whose entries are not named after scans."""
@@ -85,6 +86,22 @@ def purge_scans(spool: Spool, scan_ids: Sequence[str], deleted: Deleted) -> None
         for one in others:
             with suppress(NoScanError), _removable(spool, one, listed) as paths:
                 _purge(spool, one, paths, deleted)
+
+
+def refuse_counting(counting: Mapping[str, str], *, scan_id: str = "", label: str = "") -> None:
+    """Let no scan in the console's countdown be deleted: the spool has nothing of it yet, and it
+    would be taken.
+
+    Args:
+        counting: scans in their countdown, with their labels.
+
+    Raises:
+        SpoolError: this scan, or one with this label, is among them.
+    """
+    wanted = plain_label(label)
+    for one, of in counting.items():
+        if one == scan_id or plain_label(of) == wanted != "":
+            raise SpoolError(f"scan {one} is being taken; try again when it is done")
 
 
 def forget_labels(index: ScanIndex) -> None:
@@ -179,6 +196,8 @@ def purge(
         if old:
             expire_old(spool, config.retention, deleted=deleted)
         else:
+            counting = counting_down(config.runtime.folder)
+            refuse_counting(counting, scan_id=scan_id or "", label=label or "")
             scans: Sequence[str] = [scan_id] if scan_id else labelled(spool, str(label))
             if not scans:
                 raise NoScanError(
