@@ -1,0 +1,79 @@
+"""Refusals of the API that tell what is missing, and what a program can do about it."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from live_console import API
+
+from station.archive.phrases import untranslated
+from station.console.api import results
+from station.console.api.console import Console
+from station.console.app import create_app
+from station.core.config_file import load_config
+from station.core.files import write_json
+
+_RESULT = "20261121T100000Z-0001"
+_TABLE = {"format": "booth-measurements", "version": 1, "pose": "as-scanned", "measurements": []}
+
+
+@pytest.fixture
+def parts(option: list[str]) -> Iterator[Console]:
+    """A console whose station does not run."""
+    path = Path(option[1])
+    console = Console(load_config(path), path, logging.getLogger())
+    yield console
+    console.vault.close()
+    console.audit.close()
+
+
+def _ask(console: Console, method: str, path: str, token: str = "") -> httpx.Response:
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+
+    async def answer() -> httpx.Response:
+        transport = httpx.ASGITransport(create_app(console))
+        url = f"http://127.0.0.1{API}"
+        async with httpx.AsyncClient(transport=transport, base_url=url) as client:
+            return await client.request(method, path, headers=headers)
+
+    return asyncio.run(answer())
+
+
+@pytest.mark.parametrize("torn", [None, '{"status": "o', "[]", '{"status": []}'])
+def test_nothing_is_told_of_a_result_whose_verdict_is_lost(
+    parts: Console, torn: str | None
+) -> None:
+    """Its files were refused, and its table, sheet and archive were not."""
+    folder = parts.spool.path("outbox", _RESULT)
+    for name in ("measurements.json", "measurements-standard.json"):
+        write_json(folder / name, _TABLE)
+    assert _ask(parts, "GET", f"/scans/{_RESULT}/measurements.csv").status_code == 200
+    result = folder / "result.json"
+    result.unlink() if torn is None else result.write_text(torn)
+    for what in (
+        "measurements", "measurements.csv", "individual.smis", "sheet.pdf", "result.zip", "files",
+        "files/measurements.json", "quality", "comparison/20261123T100000Z-0003",
+        "comparison/20261123T100000Z-0003/distances",
+    ):  # fmt: skip
+        refused = _ask(parts, "GET", f"/scans/{_RESULT}/{what}")
+        assert refused.status_code == 409, what
+        assert refused.json()["detail"] == f"the result of {_RESULT} is damaged; scan again"
+
+
+def test_a_disk_that_refuses_is_not_said_to_have_damaged_a_result(
+    parts: Console, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(results, "read_bounded_json", refused)
+    told = _ask(parts, "GET", f"/scans/{_RESULT}/files").json()["detail"]
+    assert told.endswith("cannot be read (Input/output error); check the spool's disk")
+    assert untranslated(told) == []
