@@ -159,7 +159,7 @@ def _removable(
         known = (path for path in listed.get(scan_id, ()) if path.parent.name != "locks")
         found = sorted(path for path in {*known, *now} if os.path.lexists(path))
         if not found:
-            raise NoScanError(f"there is no scan {scan_id} in {spool.folder}")
+            raise NoScanError(f"there is no scan {scan_id}; see station list")
         yield found
     finally:
         if lock is not None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from fastapi import FastAPI
 from live_console import API
 
 from station.archive.phrases import untranslated
@@ -36,12 +37,15 @@ def parts(option: list[str]) -> Iterator[Console]:
 
 def _ask(console: Console, method: str, path: str, token: str = "") -> httpx.Response:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
+    return _answer(create_app(console), method, f"http://127.0.0.1{API}{path}", headers)
 
+
+def _answer(
+    app: FastAPI, method: str, url: str, headers: dict[str, str] | None = None
+) -> httpx.Response:
     async def answer() -> httpx.Response:
-        transport = httpx.ASGITransport(create_app(console))
-        url = f"http://127.0.0.1{API}"
-        async with httpx.AsyncClient(transport=transport, base_url=url) as client:
-            return await client.request(method, path, headers=headers)
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app)) as client:
+            return await client.request(method, url, headers=headers)
 
     return asyncio.run(answer())
 
@@ -77,3 +81,24 @@ def test_a_disk_that_refuses_is_not_said_to_have_damaged_a_result(
     told = _ask(parts, "GET", f"/scans/{_RESULT}/files").json()["detail"]
     assert told.endswith("cannot be read (Input/output error); check the spool's disk")
     assert untranslated(told) == []
+
+
+@pytest.mark.parametrize("method", ["GET", "DELETE"])
+def test_what_is_missing_is_told_by_its_name(parts: Console, method: str) -> None:
+    """The spool's place on the disk was told to programs."""
+    missing = "20261130T100000Z-7f3a"
+    answer = _ask(parts, method, f"/scans/{missing}")
+    told = answer.json()["detail"]
+    assert answer.status_code == 404
+    assert told.partition("; ")[0] == f"there is no scan {missing}"
+    assert str(parts.spool.folder) not in told
+    assert untranslated(told) == []
+
+
+def test_a_mesh_that_is_none_is_told_by_its_name(parts: Console) -> None:
+    other = "20261123T100000Z-0003"
+    for one in (_RESULT, other):
+        (parts.spool.path("outbox", one) / "mesh.ply").write_text("ply")
+    answer = _ask(parts, "GET", f"/scans/{_RESULT}/comparison/{other}")
+    assert answer.status_code == 409
+    assert answer.json()["detail"].startswith(f"mesh.ply of {_RESULT} is not a mesh")
