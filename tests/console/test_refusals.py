@@ -17,9 +17,11 @@ from live_console import API
 from station.archive.phrases import untranslated
 from station.console.api import results
 from station.console.api.console import Console
+from station.console.api.problems import install
 from station.console.app import create_app
 from station.core.config_file import load_config
 from station.core.files import write_json
+from station.messaging.asking import RefusedError
 
 _RESULT = "20261121T100000Z-0001"
 _TABLE = {"format": "booth-measurements", "version": 1, "pose": "as-scanned", "measurements": []}
@@ -102,3 +104,18 @@ def test_a_mesh_that_is_none_is_told_by_its_name(parts: Console) -> None:
     answer = _ask(parts, "GET", f"/scans/{_RESULT}/comparison/{other}")
     assert answer.status_code == 409
     assert answer.json()["detail"].startswith(f"mesh.ply of {_RESULT} is not a mesh")
+
+
+def test_a_refusal_names_requests_that_do_what_its_commands_do() -> None:
+    """Programs were told to run commands."""
+    app = FastAPI()
+    install(app)
+    words = "scan a can no longer be cancelled (its state is delivered)"
+
+    @app.get("/")
+    def refuse() -> None:
+        raise RefusedError(f"{words}; delete it with: station purge a; see station list")
+
+    told = _answer(app, "GET", "http://127.0.0.1/").json()["detail"]
+    assert told == f"{words}; delete it with: DELETE /api/v1/scans/a; see GET /api/v1/scans"
+    assert untranslated(told) == []
