@@ -25,6 +25,7 @@ from live_console import API, LiveConsole
 from station.archive.surfaces import read_mesh
 from station.booth.deletion import purge
 from station.booth.operator.sensors_cli import cancel
+from station.console.security.vault import Vault
 from station.core.rig import Rig
 from station.handover.ledger import Ledger, Waiting
 from station.messaging.countdowns import begin_countdown, counting_down, end_countdown
@@ -179,6 +180,29 @@ def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
         assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
         assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
     assert counting_down(console.config.runtime.folder) == {}
+
+
+def test_a_token_that_only_scans_follows_its_scan(console: LiveConsole) -> None:
+    """It could, and nothing said so; and it was told of all results that wait to be handed over."""
+    vault = Vault(console.config.console.folder)
+    kiosk, other = (vault.make_token(name, ["scan"], 1.0) for name in ("kiosk", "other"))
+    vault.close()
+    order: dict[str, Any] = {"json": {"label": "kiosk", "countdown_s": 20}}
+    headers = {"Idempotency-Key": "mine", "Authorization": f"Bearer {kiosk}"}
+    with console.sensors(), console.anonymous() as client:
+        first = client.post("/scans", **order, headers=headers).json()
+        try:
+            assert client.post("/scans", **order, headers=headers).json() == first
+            asked = client.get(f"/scans/{first['scan_id']}", headers=headers)
+            assert "needs the scope read" in _problem(asked, 403, "not-allowed")["detail"]
+            _problem(client.post("/booth/hand-over", headers=headers), 403, "not-allowed")
+            # Another one's key is another key.
+            theirs = {**headers, "Authorization": f"Bearer {other}"}
+            _problem(client.post("/scans", **order, headers=theirs), 409, "refused")
+        finally:
+            client.post(f"/scans/{first['scan_id']}/cancel", headers=headers)
+        gone = client.post("/scans", **order, headers=headers).json()
+        assert (gone["scan_id"], gone["state"]) == (first["scan_id"], "failed")
 
 
 def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:

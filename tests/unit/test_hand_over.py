@@ -337,7 +337,9 @@ def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
     ledger.keep(later)
     told: Any = SimpleNamespace(config=config, ledger=ledger)
     # The hour after which it would have been tried was told.
-    assert [(one.error, one.next_try) for one in hand_over(told, told)] == [("does not exist", "")]
+    assert [(one.error, one.next_try) for one in hand_over(told, told, told)] == [
+        ("does not exist", "")
+    ]
     handover.try_all("share", 1e9)
     assert ledger.receivers(_IDS[0]) == ["share"]
 

@@ -77,7 +77,8 @@ def list_scans(
 
 @router.post("", status_code=202, responses=responses(404, 409))
 def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Scan:
-    """Take a scan. With an Idempotency-Key the same request never scans twice."""
+    """Take a scan. With an Idempotency-Key the same request never scans twice: it tells the scan's
+    state, also to a token without the scope read."""
     fresh = new_scan_id()
     mark = f"{fresh} {boot_id()} {time.monotonic():.3f}"
     first = once(console, caller, key, body.model_dump_json(), mark)
