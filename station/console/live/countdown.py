@@ -100,10 +100,10 @@ class ScanCountdown:
             waiting = self._waiting[scan_id]
             if waiting.state != "countdown":
                 return
-            if not end_countdown(self._folder, scan_id):
-                self._end(scan_id, waiting, CANCELLED)
-                return
             try:
+                if not end_countdown(self._folder, scan_id):
+                    self._end(scan_id, waiting, CANCELLED)
+                    return
                 command(self._config, Request("scan", scan_id, waiting.label))
             except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
                 # Whatever it is: a countdown that does not end keeps all other scans waiting.
