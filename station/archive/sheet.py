@@ -38,7 +38,8 @@ from station.core.words.terms import Language, verdict_words
 _WIDTH, _HEIGHT = A4
 _MARGIN = 34.0
 _MOST_LETTERS = 200
-"""Letters of a label that are looked at: no more than a hundred fit into the head."""
+"""Letters of a label, or of a line of reasons, that are looked at: no more fit into the head."""
+_REASONS_SIZE, _REASONS_LINES = 7.0, 3
 _FIGURE_TOP, _FIGURE_HEIGHT = _HEIGHT - 104.0, 316.0
 _ROW_HEIGHT = 13.6
 _DIFFERENCE = 60.0
@@ -140,24 +141,36 @@ def _head(canvas: Canvas, scan: ScanRecord, pose: Pose, unit: Unit, language: La
         canvas, _WIDTH - _MARGIN - width + 12, _HEIGHT - 57, verdict, 22, HexColor("#ffffff"), True
     )
     room = _WIDTH - 2 * _MARGIN - width - 16
-    label = _cut(scan.label or words["unlabelled"], room)
+    label = _cut(scan.label or words["unlabelled"], room, 20, bold=True)
     _text(canvas, _MARGIN, _HEIGHT - 52, label, 20, _INK, True)
     moment = scan.created.replace("T", "  ").removesuffix("Z") + " UTC"
     facts = [moment, scan.scan_id, scan.booth, words[pose], unit]
     _text(canvas, _MARGIN, _HEIGHT - 68, "   ·   ".join(filter(None, facts)), 8.5, _GREY)
-    reasons = in_language("; ".join(scan.reasons), language)
-    if reasons:
-        _text(canvas, _MARGIN, _HEIGHT - 82, reasons[:150], 8, colour)
+    for number, line in enumerate(_lines(in_language("; ".join(scan.reasons), language))):
+        _text(canvas, _MARGIN, _HEIGHT - 79 - 8 * number, line, _REASONS_SIZE, colour)
     canvas.setStrokeColor(_RULE)
-    canvas.line(_MARGIN, _HEIGHT - 90, _WIDTH - _MARGIN, _HEIGHT - 90)
+    canvas.line(_MARGIN, _HEIGHT - 99, _WIDTH - _MARGIN, _HEIGHT - 99)
 
 
-def _cut(label: str, room: float) -> str:
-    """A label, cut to the width of the head."""
-    label = label[:_MOST_LETTERS]
-    while len(label) > 4 and _width(label, 20, bold=True) > room:
-        label = label[:-2] + "…"
-    return label
+def _cut(text: str, room: float, size: float, *, bold: bool = False) -> str:
+    """A text, cut to the width that it has."""
+    if len(text) > _MOST_LETTERS:
+        text = text[: _MOST_LETTERS - 1] + "…"
+    while len(text) > 4 and _width(text, size, bold) > room:
+        text = text[:-2] + "…"
+    return text
+
+
+def _lines(reasons: str) -> list[str]:
+    """The head's lines of reasons, broken between words where there are any."""
+    room, lines = _WIDTH - 2 * _MARGIN, list[str]()
+    while len(lines) < _REASONS_LINES and (line := _cut(reasons, room, _REASONS_SIZE)):
+        if line != reasons and len(lines) < _REASONS_LINES - 1:
+            end = reasons.rfind(" ", 1, len(line))
+            line = reasons[: end if end > 0 else len(line) - 1]
+        lines.append(line)
+        reasons = reasons[len(line) :].lstrip()
+    return lines
 
 
 def _figures(

@@ -53,7 +53,9 @@ def read_mesh(path: Path) -> Surface:
     except OSError:
         raise FormatError(f"{path.parent.name} has no {path.name}") from None
     except (KeyError, IndexError, ValueError, OverflowError) as cause:
-        raise FormatError(f"{path} is not a mesh that this program wrote ({cause})") from None
+        raise FormatError(
+            f"{path.name} of {path.parent.name} is not a mesh that this program wrote ({cause})"
+        ) from None
     stacked = np.stack([points["x"], points["y"], points["z"]], axis=1)
     return Surface(stacked.astype(np.float64), corners["corners"].copy())
 

@@ -47,13 +47,24 @@ def read_measurements(folder: Path, pose: Pose) -> dict[str, Any]:
     try:
         document = read_bounded_json(path, MAX_JSON_BYTES)
     except OSError:
-        raise FormatError(f"{folder.name} has no {path.name}; scan again") from None
+        raise FormatError(f"{folder.name} has no {path.name}; {_remedy(folder)}") from None
     except ValueError as cause:
-        raise FormatError(f"{path.name} of {folder.name} is damaged ({cause})") from None
+        words = f"{path.name} of {folder.name} is damaged ({cause}); {_remedy(folder)}"
+        raise FormatError(words) from None
     known = isinstance(document, dict) and document.get("format") == "booth-measurements"
     if not known or document.get("version") != 1:
-        raise FormatError(f"{path} is not booth-measurements version 1")
+        raise FormatError(
+            f"{path.name} of {folder.name} is not booth-measurements version 1; {_remedy(folder)}"
+        )
     return dict(document)
+
+
+def _remedy(folder: Path) -> str:
+    """Remedy for a result whose table cannot be read: its bundle is kept for some days."""
+    kept = folder.parent.parent / "done" / folder.name
+    if not (kept / "bundle.json").exists():
+        return "scan again"
+    return f"scan again, or in the spool's folder: reconstruct fit done/{folder.name} --out result"
 
 
 def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[str, Any]]:

@@ -21,6 +21,7 @@ from station.core.scans import STATES, Notes, ScanId, boot_id, plain_label, scan
 from station.core.service import set_up_logs
 from station.core.spool import Spool
 from station.handover.ledger import Ledger
+from station.messaging.countdowns import counting_down
 
 _OF_OTHERS = ("cameras", "handover")
 """Folders of the spool whose entries are not named after scans."""
@@ -87,6 +88,22 @@ def purge_scans(spool: Spool, scan_ids: Sequence[str], deleted: Deleted) -> None
                 _purge(spool, one, paths, deleted)
 
 
+def refuse_counting(counting: Mapping[str, str], *, scan_id: str = "", label: str = "") -> None:
+    """Let no scan in the console's countdown be deleted: the spool has nothing of it yet, and it
+    would be taken.
+
+    Args:
+        counting: scans in their countdown, with their labels.
+
+    Raises:
+        SpoolError: this scan, or one with this label, is among them.
+    """
+    wanted = plain_label(label)
+    for one, of in counting.items():
+        if one == scan_id or plain_label(of) == wanted != "":
+            raise SpoolError(f"scan {one} is being taken; try again when it is done")
+
+
 def forget_labels(index: ScanIndex) -> None:
     """Let labels leave the index together with their scans, not at the next query."""
     with suppress(IndexBusyError):  # the disk is full; then at the next one
@@ -142,7 +159,7 @@ def _removable(
         known = (path for path in listed.get(scan_id, ()) if path.parent.name != "locks")
         found = sorted(path for path in {*known, *now} if os.path.lexists(path))
         if not found:
-            raise NoScanError(f"there is no scan {scan_id} in {spool.folder}")
+            raise NoScanError(f"there is no scan {scan_id}; see station list")
         yield found
     finally:
         if lock is not None:
@@ -179,6 +196,8 @@ def purge(
         if old:
             expire_old(spool, config.retention, deleted=deleted)
         else:
+            counting = counting_down(config.runtime.folder)
+            refuse_counting(counting, scan_id=scan_id or "", label=label or "")
             scans: Sequence[str] = [scan_id] if scan_id else labelled(spool, str(label))
             if not scans:
                 raise NoScanError(

@@ -26,8 +26,9 @@ class Waiting:
     target: str
     scan_id: str
     tries: int = 0
+    """Failures, without those of tries before their time."""
     next_s: float = 0.0
-    """Moment of the next try, seconds since 1970."""
+    """Moment of the next try, seconds since 1970; 0: now, before its time if any has failed."""
     error: str = ""
 
     def due(self, now_s: float) -> bool:
@@ -41,8 +42,11 @@ class Waiting:
 
     def failed(self, error: str, now_s: float) -> Waiting:
         """The entry after one more failure, with a longer pause."""
-        pause_s = PAUSES_S[min(max(self.tries, 0), len(PAUSES_S) - 1)]
-        return replace(self, tries=self.tries + 1, next_s=now_s + pause_s, error=error)
+        # A try before its time, as an operator asks for it, makes no pause longer.
+        counts = self.tries <= 0 or self.next_s != 0.0
+        tries = max(self.tries, 0) + counts
+        pause_s = PAUSES_S[min(tries, len(PAUSES_S)) - 1]
+        return replace(self, tries=tries, next_s=now_s + pause_s, error=error)
 
 
 class Ledger:

@@ -14,6 +14,7 @@ import click
 
 from station.calibration.detect.step_names import EMPTY
 from station.core.commands import Number, writable_folder
+from station.core.config import SHORTEST_WAVING_S
 from station.core.errors import InputError
 from station.core.service import die_with_parent
 from station.sensors.recording import RecordedFrame, write_recording
@@ -31,9 +32,6 @@ HEADING = "# A virtual booth: four replayed Kinects."
 """First line of its booth.toml."""
 _UNIT_BIAS_M = 0.010
 """Each unit's systematic depth error if a calibration is recorded."""
-_SHORTEST_S = 16.0
-"""Waving in which every camera sees the ball often enough for a calibration. 60 times are needed;
-the fewest in eight booths were 97, and 46 in 12 s."""
 _PROCESSES = 2
 
 
@@ -80,7 +78,7 @@ _COUNT, _SEED = click.IntRange(1), click.IntRange(0)
 @click.option(
     "--calibration",
     "waving_s",
-    type=Number(_SHORTEST_S, 600.0, unit="seconds"),
+    type=Number(SHORTEST_WAVING_S, 600.0, unit="seconds"),
     help="also record a calibration, the ball waved for so many seconds; sensors then have depth "
     "errors of their own, and no calibration.json is written",
 )

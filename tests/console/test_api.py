@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,16 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from live_console import API, LiveConsole
 
 from station.archive.surfaces import read_mesh
+from station.booth.deletion import purge
+from station.booth.operator.sensors_cli import cancel
+from station.console.security.vault import Vault
 from station.core.rig import Rig
 from station.handover.ledger import Ledger, Waiting
+from station.messaging.countdowns import begin_countdown, counting_down, end_countdown
 
 README = Path(__file__).parents[2] / "README.md"
 
@@ -154,6 +160,57 @@ def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole)
         finally:
             client.post(f"/scans/{scan['scan_id']}/cancel")
         _problem(client.delete("/scans?label=Order 8"), 404, "no-such-scan")
+
+
+def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
+    """They said that there was no such scan, and it was taken seconds later."""
+    option = ["--config", str(console.station.config)]
+    with console.sensors(), console.client() as client:
+        scan = client.post("/scans", json={"label": "Order 9", "countdown_s": 20}).json()
+        scan_id = scan["scan_id"]
+        for words in ([scan_id], ["--label", "Order\u3000 9"]):
+            told = str(CliRunner().invoke(purge, [*words, *option]).exception)
+            assert told == f"scan {scan_id} is being taken; try again when it is done"
+        assert "no scan with the label" in str(
+            CliRunner().invoke(purge, ["--label", "Order", *option]).exception
+        )
+        done = CliRunner().invoke(cancel, [scan_id, *option])
+        assert done.output == f"scan {scan_id}: cancelled by the operator\n", done.exception
+        found = console.wait_for(scan_id)
+        assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
+        assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
+    assert counting_down(console.config.runtime.folder) == {}
+
+
+def test_a_token_that_only_scans_follows_its_scan(console: LiveConsole) -> None:
+    """It could, and nothing said so; and it was told of all results that wait to be handed over."""
+    vault = Vault(console.config.console.folder)
+    kiosk, other = (vault.make_token(name, ["scan"], 1.0) for name in ("kiosk", "other"))
+    vault.close()
+    order: dict[str, Any] = {"json": {"label": "kiosk", "countdown_s": 20}}
+    headers = {"Idempotency-Key": "mine", "Authorization": f"Bearer {kiosk}"}
+    with console.sensors(), console.anonymous() as client:
+        first = client.post("/scans", **order, headers=headers).json()
+        try:
+            assert client.post("/scans", **order, headers=headers).json() == first
+            asked = client.get(f"/scans/{first['scan_id']}", headers=headers)
+            assert "needs the scope read" in _problem(asked, 403, "not-allowed")["detail"]
+            _problem(client.post("/booth/hand-over", headers=headers), 403, "not-allowed")
+            # Another one's key is another key.
+            theirs = {**headers, "Authorization": f"Bearer {other}"}
+            _problem(client.post("/scans", **order, headers=theirs), 409, "refused")
+        finally:
+            client.post(f"/scans/{first['scan_id']}/cancel", headers=headers)
+        gone = client.post("/scans", **order, headers=headers).json()
+        assert (gone["scan_id"], gone["state"]) == (first["scan_id"], "failed")
+
+
+def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:
+    begin_countdown(tmp_path, "one", "Order 1", time.monotonic() - 60.0)
+    assert counting_down(tmp_path) == {}
+    begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
+    assert counting_down(tmp_path) == {"two": "Order 2"}
+    assert not end_countdown(tmp_path, "one")
 
 
 def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) -> None:

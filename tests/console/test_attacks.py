@@ -12,11 +12,13 @@ from xml.etree import ElementTree
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from live_console import API, PASSWORD, LiveConsole
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from station.booth.operator.scan_cli import scan
 from station.console.api.console import key_of
 from station.console.api.models import NewScan
 from station.console.security.throttle import AT_ONCE, FREE_TRIES
@@ -108,7 +110,13 @@ def test_a_refused_request_may_be_sent_again(console: LiveConsole) -> None:
     with console.client() as client:
         refused = client.post("/scans", **request)  # type: ignore[arg-type]
         assert refused.status_code == 409
-        assert "sensors are stopped" in refused.json()["detail"]
+        # Programs were told a command.
+        remedy = "switch them on with POST /api/v1/booth/start"
+        for told in (refused, client.post("/scans", json={"label": "at once"})):
+            assert told.json()["detail"] == f"the sensors are stopped; {remedy}"
+        option = ["--config", str(console.station.config)]
+        typed = str(CliRunner().invoke(scan, option).exception)
+        assert typed == "the sensors are stopped; run station start first"
         with console.sensors():
             taken = client.post("/scans", **request)  # type: ignore[arg-type]
             assert taken.status_code == 202

@@ -25,6 +25,7 @@ from live_console import LiveConsole
 from station.archive import sheet
 from station.archive.compare import compare_rows
 from station.archive.index import ScanIndex
+from station.archive.phrases import in_language
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import seamly_name, smis
@@ -176,9 +177,27 @@ def test_a_long_label_is_cut_without_a_look_at_each_letter(
         return float(len(text))
 
     monkeypatch.setattr(sheet, "_width", width)
-    assert sheet._cut("i" * 100_000, 40.0) == "i" * 39 + "…"
+    assert sheet._cut("i" * 100_000, 40.0, 20.0) == "i" * 39 + "…"
     assert len(looks) < 200
-    assert sheet._cut("Order 1", 40.0) == "Order 1"
+    assert sheet._cut("Order 1", 40.0, 20.0) == "Order 1"
+
+
+def test_the_sheet_tells_all_reasons_or_that_there_are_more() -> None:
+    """They ended after 150 letters, within a word."""
+    reasons = [f"the cameras saw only {share} % of the left forearm" for share in range(10, 30)]
+    for some in (reasons[:2], reasons[:8]):
+        lines = sheet._lines("; ".join(some))
+        assert " ".join(lines) == "; ".join(some)
+    assert len(lines) == 3
+    *whole, last = sheet._lines("; ".join(reasons))
+    assert "; ".join(reasons).startswith(" ".join([*whole, last.removesuffix("…")]))
+    assert last.endswith("…")
+    chinese = in_language("; ".join(reasons[:8]), "zh")
+    assert "".join(sheet._lines(chinese)).replace(" ", "") == chinese.replace(" ", "")
+    room = sheet._WIDTH - 2 * sheet._MARGIN
+    for line in (*whole, last, *sheet._lines(chinese), *sheet._lines("i" * 100_000)):
+        assert sheet._width(line, sheet._REASONS_SIZE) <= room
+    assert sheet._lines("") == []
 
 
 def test_the_sheet_of_a_body_without_a_neck_to_measure(

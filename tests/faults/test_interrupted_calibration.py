@@ -46,7 +46,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     path = tmp_path / "booth.toml"
-    lines = ["[calibrate]", "waving_s = 10"]
+    lines = ["[calibrate]", "waving_s = 16"]
     for name in CAMERAS:
         lines += ["[[cameras]]", f'name = "{name}"', 'driver = "recorded"', 'recording = "none"']
     path.write_text("\n".join(lines))

@@ -68,6 +68,8 @@ def test_relative_paths_belong_to_the_file(tmp_path: Path) -> None:
         (_CAMERA + "[volume]\nmin_m = [1, 1, 1]\nmax_m = [0, 2, 2]", "max_m must exceed min_m"),
         (_CAMERA + _CAMERA, "the camera name front is used twice"),
         (_CAMERA + '[calibrate]\nfront = ["{x}"]', "calibrate names {x}, which is not a camera"),
+        (_CAMERA + "[calibrate]\nwaving_s = 15", "calibrate.waving_s: must be at least 16 s: in"),
+        (_CAMERA + "[calibrate]\nwaving_s = nan", "calibrate.waving_s"),
         (_CAMERA + "[calibrate]\nball_radius_m = 0.06", "not found reliably beyond 2.4 m"),
         (_CAMERA + "[calibrate]\nball_radius_m = 0.2", "radius, which is half its diameter"),
         (_CAMERA.replace("front", "../front", 1), "letters, digits"),

@@ -337,9 +337,34 @@ def test_what_failed_is_tried_at_once_if_somebody_asks_for_it(
     ledger.keep(later)
     told: Any = SimpleNamespace(config=config, ledger=ledger)
     # The hour after which it would have been tried was told.
-    assert [(one.error, one.next_try) for one in hand_over(told, told)] == [("does not exist", "")]
+    assert [(one.error, one.next_try) for one in hand_over(told, told, told)] == [
+        ("does not exist", "")
+    ]
     handover.try_all("share", 1e9)
     assert ledger.receivers(_IDS[0]) == ["share"]
+
+
+def test_a_try_that_somebody_asks_for_makes_no_pause_longer(
+    handover: HandOver, tmp_path: Path
+) -> None:
+    """After a few presses of "Try now" the booth itself tried only once in an hour."""
+
+    def down(scan: ScanRecord, result: Path) -> None:  # noqa: ARG001
+        raise HandOverError("it answers 503")
+
+    ledger = Ledger(tmp_path / "spool")
+    handover._targets["share"] = down
+    handover.look()
+    for now_s in (1e9, 1e9 + 100.0):
+        handover.try_all("share", now_s)
+    for now_s in (1e9 + 101.0, 1e9 + 102.0, 1e9 + 103.0):
+        ledger.try_now(["share"])
+        handover.try_all("share", now_s)
+    [entry] = ledger.waiting()
+    assert (entry.tries, round(entry.next_s)) == (2, 1e9 + 103.0 + PAUSES_S[1])
+    handover.try_all("share", 1e9 + 200.0)
+    [entry] = ledger.waiting()
+    assert (entry.tries, round(entry.next_s)) == (3, 1e9 + 200.0 + PAUSES_S[2])
 
 
 def test_a_result_that_the_disk_refuses_to_read_waits_until_its_verdict_is_known(

@@ -16,6 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
+from station.archive.phrases import untranslated
 from station.booth.operator import scan_cli
 from station.booth.operator.scan_cli import _follow, scan, show_result
 from station.booth.operator.sensors_cli import cancel, start, stop
@@ -65,9 +66,26 @@ def test_a_result_is_printed_with_plain_names_and_both_sides_on_a_line(
 
 
 def test_a_result_whose_table_is_damaged_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "measurements.json").write_text("{")
-    with pytest.raises(FormatError, match="damaged"):
-        show_result(tmp_path)
+    """Nothing told what to do about it."""
+    result, bundle = tmp_path / "outbox" / "one", tmp_path / "done" / "one"
+    for folder in (result, bundle):
+        folder.mkdir(parents=True)
+    table = result / "measurements.json"
+    again = "in the spool's folder: reconstruct fit done/one --out result"
+    for text, words in (
+        (None, "one has no measurements.json"),
+        ("{", "measurements.json of one is damaged"),
+        ("{}", "measurements.json of one is not booth-measurements version 1"),
+    ):
+        if text is not None:
+            table.write_text(text)
+        (bundle / "bundle.json").touch()
+        with pytest.raises(FormatError, match=f"^{words}.*; scan again, or {again}$") as told:
+            show_result(result)
+        assert untranslated(str(told.value)) == []
+        (bundle / "bundle.json").unlink()
+        with pytest.raises(FormatError, match=f"^{words}.*; scan again$"):
+            show_result(result)
 
 
 def _run(command: click.Command, config: BoothConfig, *words: str) -> Result:

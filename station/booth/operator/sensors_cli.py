@@ -94,7 +94,8 @@ def stop(config_path: Path | None) -> None:
 @click.argument("scan_id")
 @config_option
 def cancel(scan_id: str, config_path: Path | None) -> None:
-    """Cancel a scan that is being taken or is waiting to be reconstructed.
+    """Cancel a scan that is being taken, also in the console's countdown, or is waiting to be
+    reconstructed.
 
     \b
     Examples:

@@ -155,8 +155,8 @@ def booth(console: Booth, caller: Reader) -> BoothState:  # noqa: ARG001
 
 
 @router.post("/booth/hand-over", responses=responses(), tags=["booth"])
-def hand_over(console: Booth, caller: Scanner) -> list[Delivery]:  # noqa: ARG001
-    """Try at once what waits to be handed over; what waits."""
+def hand_over(console: Booth, caller: Scanner, reader: Reader) -> list[Delivery]:  # noqa: ARG001
+    """Try at once what waits to be handed over; what waits. Needs the scope read, too."""
     waiting = console.ledger.try_now(_targets(console))
     return [Delivery(**entry.document()) for entry in waiting]
 

@@ -77,7 +77,7 @@ class Delivery(BaseModel):
 
     target: str
     scan_id: str
-    tries: int
+    tries: int = Field(description="failures; what was tried before its time is not counted")
     next_try: str
     error: str
 

@@ -1,7 +1,9 @@
-"""Errors as problem documents (RFC 9457), with the messages and remedies of the commands."""
+"""Errors as problem documents (RFC 9457), with the messages of the commands and remedies of the
+API."""
 
 from __future__ import annotations
 
+import re
 from http import HTTPStatus
 from typing import Any
 
@@ -26,7 +28,15 @@ class Problem(BaseModel):
     type: str = Field(description="/problems/<kind>; stays the same over releases")
     title: str
     status: int
-    detail: str = Field(description="problem and remedy, in the words of the commands")
+    detail: str = Field(description="problem and remedy; requests instead of commands")
+
+
+_REMEDIES = (
+    (re.compile("run station start first"), "switch them on with POST /api/v1/booth/start"),
+    (re.compile("see station list"), "see GET /api/v1/scans"),
+    (re.compile(r"with: station purge (\S+)"), r"with: DELETE /api/v1/scans/\1"),
+)
+"""Commands that a refusal names, and the requests that do the same."""
 
 
 class ProblemError(Exception):
@@ -114,6 +124,8 @@ def install(app: FastAPI) -> None:
 def _answer(
     status: int, kind: str, detail: str, headers: dict[str, str] | None = None
 ) -> JSONResponse:
+    for command, request in _REMEDIES:
+        detail = command.sub(request, detail)
     title = HTTPStatus(status).phrase if kind == "http" else kind.replace("-", " ")
     problem = Problem(type=f"/problems/{kind}", title=title, status=status, detail=detail)
     return JSONResponse(problem.model_dump(), status, headers, media_type=MEDIA_TYPE)

@@ -22,8 +22,8 @@ from station.console.api.console import Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
 from station.console.api.problems import ProblemError, responses
 from station.console.api.scans import of_record
-from station.core.errors import FormatError
-from station.core.files import MAX_JSON_BYTES, read_bounded_json
+from station.core.errors import DiskReadError, FormatError
+from station.core.files import MAX_JSON_BYTES, OF_THE_DISK, read_bounded_json
 from station.core.words.tables import Pose
 from station.core.words.terms import Language, part_in_words
 
@@ -34,17 +34,26 @@ UnitQuery = Annotated[Unit, Query()]
 LanguageQuery = Annotated[Language, Query()]
 
 
-def _open(console: Console, caller: Caller, scan_id: str, what: str) -> tuple[ScanRecord, Path]:
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A delivered scan, its folder and its `result.json`, without which no number has a verdict."""
+
+    record: ScanRecord
+    folder: Path
+    result: dict[str, Any]
+
+
+def _open(console: Console, caller: Caller, scan_id: str, what: str) -> _Opened:
     record, folder = console.result(scan_id)
     console.audit.note(caller.name, caller.address, f"read {what}", scan_id)
-    return record, folder
+    return _Opened(record, folder, _result(folder))
 
 
 @router.get("/files", responses=responses(404, 409))
 def files(scan_id: ScanId, console: Booth, caller: Reader) -> list[File]:
     """The result's files."""
-    _, folder = _open(console, caller, scan_id, "list of files")
-    hashes = _result(folder).get("files", {})
+    opened = _open(console, caller, scan_id, "list of files")
+    hashes = opened.result.get("files", {})
     return [
         File(
             name=path.name,
@@ -52,7 +61,7 @@ def files(scan_id: ScanId, console: Booth, caller: Reader) -> list[File]:
             sha256=str(hashes.get(path.name, "")),
             media_type=MEDIA_TYPES.get(path.suffix, "application/octet-stream"),
         )
-        for path in sorted(folder.iterdir())
+        for path in sorted(opened.folder.iterdir())
         if path.is_file()
     ]
 
@@ -81,11 +90,11 @@ def file(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """One file; ranges and entity tags are understood."""
-    _, folder = _open(console, caller, scan_id, name)
-    path = folder / name
-    if path.is_symlink() or not path.is_file() or path.parent != folder:
+    opened = _open(console, caller, scan_id, name)
+    path = opened.folder / name
+    if path.is_symlink() or not path.is_file() or path.parent != opened.folder:
         raise ProblemError(404, "no-such-file", f"scan {scan_id} has no file {name}")
-    digest = _result(folder).get("files", {}).get(name) or f"{path.stat().st_mtime_ns:x}"
+    digest = opened.result.get("files", {}).get(name) or f"{path.stat().st_mtime_ns:x}"
     tag = f'"{digest}"'
     known = {part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")}
     if known & {tag, "*"}:
@@ -97,12 +106,12 @@ def file(
 @router.get("/quality", responses=responses(404, 409))
 def quality(scan_id: ScanId, console: Booth, caller: Reader) -> Quality:
     """Coverage of each part of the body, and whether the verdict doubts it."""
-    record, folder = _open(console, caller, scan_id, "quality")
-    parts = _result(folder).get("quality", {}).get("parts", {})
-    reasons = " ".join(record.reasons)
+    opened = _open(console, caller, scan_id, "quality")
+    parts = opened.result.get("quality", {}).get("parts", {})
+    reasons = " ".join(opened.record.reasons)
     return Quality(
-        verdict=record.verdict,
-        reasons=list(record.reasons),
+        verdict=opened.record.verdict,
+        reasons=list(opened.record.reasons),
         parts=[
             Part(
                 name=name,
@@ -134,8 +143,9 @@ def _selected(
     unit: UnitQuery = "cm",
     language: LanguageQuery = "en",
 ) -> _Table:
-    record, folder = _open(console, caller, scan_id, "measurements")
-    return _Table(record, read_measurements(folder, pose), pose, unit, language)
+    opened = _open(console, caller, scan_id, "measurements")
+    document = read_measurements(opened.folder, pose)
+    return _Table(opened.record, document, pose, unit, language)
 
 
 Selected = Annotated[_Table, Depends(_selected)]
@@ -187,8 +197,8 @@ def individual_smis(
     scan_id: ScanId, console: Booth, caller: Reader, pose: PoseQuery = "as-scanned"
 ) -> Response:
     """The table for SeamlyMe and Seamly2D."""
-    record, folder = _open(console, caller, scan_id, "measurements")
-    content = smis(record, read_measurements(folder, pose))
+    opened = _open(console, caller, scan_id, "measurements")
+    content = smis(opened.record, read_measurements(opened.folder, pose))
     return _attached(content, "application/xml", f"{scan_id}.smis")
 
 
@@ -206,8 +216,8 @@ def sheet(
     language: LanguageQuery = "en",
 ) -> Response:
     """A printable sheet: every line drawn on the body, and the table."""
-    record, folder = _open(console, caller, scan_id, "sheet")
-    content = sheet_pdf(record, folder, pose, unit, language)
+    opened = _open(console, caller, scan_id, "sheet")
+    content = sheet_pdf(opened.record, opened.folder, pose, unit, language)
     name = f'inline; filename="{scan_id}.pdf"'
     return Response(content, media_type="application/pdf", headers={"content-disposition": name})
 
@@ -223,8 +233,8 @@ def all_files(
     language: LanguageQuery = "en",
 ) -> Response:
     """All files, with the tables as CSV, the sheet and the .smis beside them."""
-    record, folder = _open(console, caller, scan_id, "all files")
-    content = result_zip(record, folder, unit, language)
+    opened = _open(console, caller, scan_id, "all files")
+    content = result_zip(opened.record, opened.folder, unit, language)
     return _attached(content, "application/zip", f"{scan_id}.zip")
 
 
@@ -239,15 +249,15 @@ def comparison(
     language: LanguageQuery = "en",
 ) -> Comparison:
     """Difference of the other scan from this one: each measurement, and the surfaces."""
-    record, folder = _open(console, caller, scan_id, "comparison")
-    second, other_folder = _open(console, caller, other, "comparison")
-    surfaces = compare_surfaces(folder, other_folder)
+    first = _open(console, caller, scan_id, "comparison")
+    second = _open(console, caller, other, "comparison")
+    surfaces = compare_surfaces(first.folder, second.folder)
     return Comparison(
-        first=of_record(console, record),
-        second=of_record(console, second),
+        first=of_record(console, first.record),
+        second=of_record(console, second.record),
         pose=pose,
         unit=unit,
-        rows=compare_rows(folder, other_folder, pose, unit, language),  # type: ignore[arg-type]
+        rows=compare_rows(first.folder, second.folder, pose, unit, language),  # type: ignore[arg-type]
         surface_rms_m=surfaces.rms_m,
         surface_p95_m=surfaces.p95_m,
         surface_largest_m=surfaces.largest_m,
@@ -267,15 +277,28 @@ def comparison_distances(
     scan_id: ScanId, other: ScanId, console: Booth, caller: Reader
 ) -> Response:
     """The distance map of the two surfaces."""
-    _, folder = _open(console, caller, scan_id, "comparison")
-    _, other_folder = _open(console, caller, other, "comparison")
-    signed = compare_surfaces(folder, other_folder).signed_m
+    first = _open(console, caller, scan_id, "comparison")
+    second = _open(console, caller, other, "comparison")
+    signed = compare_surfaces(first.folder, second.folder).signed_m
     return Response(signed.astype(np.dtype("<f4")).tobytes(), media_type="application/octet-stream")
 
 
 def _result(folder: Path) -> dict[str, Any]:
+    """The document with a result's verdict.
+
+    Raises:
+        FormatError: it is missing, damaged or without a verdict.
+        DiskReadError: the disk refuses to read it.
+    """
+    document = None
     try:
         document = read_bounded_json(folder / "result.json", MAX_JSON_BYTES)
-    except (OSError, ValueError):
-        raise FormatError(f"the result of {folder.name} is damaged; scan again") from None
-    return dict(document)
+    except OSError as error:
+        if error.errno in OF_THE_DISK:
+            words = f"the result of {folder.name} cannot be read ({error.strerror})"
+            raise DiskReadError(f"{words}; check the spool's disk") from None
+    except ValueError:
+        pass
+    if not isinstance(document, dict) or document.get("status") not in ("ok", "rescan"):
+        raise FormatError(f"the result of {folder.name} is damaged; scan again")
+    return document

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
 from station.archive.records import ScanRecord, ScanState, read_noted
-from station.booth.deletion import NoScanError, forget_labels, labelled, purge_scans
+from station.booth.deletion import (
+    NoScanError,
+    forget_labels,
+    labelled,
+    purge_scans,
+    refuse_counting,
+)
 from station.booth.retention import Deleted
 from station.booth.session import MAX_LABEL_LENGTH
 from station.console.api.console import (
@@ -28,7 +34,6 @@ from station.console.api.console import (
 from station.console.api.models import COMPOSED, NewScan, Removed, Scan, ScanPage
 from station.console.api.problems import ProblemError, responses
 from station.console.live.control import NotRunningError, command
-from station.core.errors import SpoolError
 from station.core.scans import boot_id, new_scan_id, plain_label, scan_id_of
 from station.messaging.asking import RefusedError
 from station.messaging.messages import Request
@@ -72,7 +77,8 @@ def list_scans(
 
 @router.post("", status_code=202, responses=responses(404, 409))
 def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = None) -> Scan:
-    """Take a scan. With an Idempotency-Key the same request never scans twice."""
+    """Take a scan. With an Idempotency-Key the same request never scans twice: it tells the scan's
+    state, also to a token without the scope read."""
     fresh = new_scan_id()
     mark = f"{fresh} {boot_id()} {time.monotonic():.3f}"
     first = once(console, caller, key, body.model_dump_json(), mark)
@@ -153,7 +159,7 @@ def cancel(scan_id: ScanId, console: Booth, caller: Scanner) -> Scan:
 @router.delete("/{scan_id}", responses=responses(404, 409))
 def delete(scan_id: ScanId, console: Booth, caller: Manager) -> Removed:
     """Delete a scan, its bundle and its results permanently."""
-    _refuse_counting(one for one in console.countdown.counting() if one == scan_id)
+    refuse_counting(console.countdown.counting(), scan_id=scan_id)
     return _delete(console, caller, [scan_id])
 
 
@@ -168,19 +174,12 @@ def delete_label(
     caller: Manager,
 ) -> Removed:
     """Delete all scans with exactly this label, which is not blank."""
-    counting = console.countdown.counting().items()
-    _refuse_counting(one for one, of in counting if plain_label(of) == plain_label(label) != "")
+    refuse_counting(console.countdown.counting(), label=label)
     # As lists show it, a blank one is that of every scan without a label.
     found = labelled(console.spool, label) if plain_label(label) else []
     if not found:
         raise ProblemError(404, "no-such-scan", "there is no scan with this label")
     return _delete(console, caller, found)
-
-
-def _refuse_counting(scan_ids: Iterable[str]) -> None:
-    """Delete no scan in its countdown: the station does not know it yet, and would take it."""
-    for scan_id in scan_ids:
-        raise SpoolError(f"scan {scan_id} is being taken; try again when it is done")
 
 
 def _delete(console: Console, caller: Caller, scan_ids: Sequence[str]) -> Removed:

@@ -14,6 +14,7 @@ from station.console.live.events import EventLog
 from station.core.config import BoothConfig
 from station.core.scans import CANCELLED
 from station.messaging.asking import RefusedError
+from station.messaging.countdowns import begin_countdown, end_countdown, is_counting_down
 from station.messaging.messages import Request
 
 _KEPT = 100
@@ -34,6 +35,7 @@ class ScanCountdown:
 
     def __init__(self, config: BoothConfig, events: EventLog) -> None:
         self._config, self._events = config, events
+        self._folder = config.runtime.folder
         self._waiting: dict[str, _Waiting] = {}
         self._lock = threading.Lock()
 
@@ -54,7 +56,9 @@ class ScanCountdown:
             # Checked first, so that the person does not hold still in vain.
             if not command(self._config, Request("status"))["streaming"]:
                 raise RefusedError("the sensors are stopped; run station start first")
-            self._waiting[scan_id] = _Waiting(label, time.monotonic() + countdown_s)
+            starts_s = time.monotonic() + countdown_s
+            begin_countdown(self._folder, scan_id, label, starts_s)
+            self._waiting[scan_id] = _Waiting(label, starts_s)
             for old in list(self._waiting)[:-_KEPT]:
                 del self._waiting[old]
             document = self._document(scan_id)
@@ -80,6 +84,7 @@ class ScanCountdown:
         with self._lock:
             waiting = self._waiting.get(scan_id)
             if waiting is not None and waiting.state == "countdown":
+                end_countdown(self._folder, scan_id)
                 self._end(scan_id, waiting, CANCELLED)
             if waiting is not None:
                 return self._document(scan_id)
@@ -96,6 +101,9 @@ class ScanCountdown:
             if waiting.state != "countdown":
                 return
             try:
+                if not end_countdown(self._folder, scan_id):
+                    self._end(scan_id, waiting, CANCELLED)
+                    return
                 command(self._config, Request("scan", scan_id, waiting.label))
             except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
                 # Whatever it is: a countdown that does not end keeps all other scans waiting.
@@ -106,7 +114,11 @@ class ScanCountdown:
     def _left_s(self, scan_id: str) -> float | None:
         with self._lock:
             waiting = self._waiting[scan_id]
-            return waiting.starts_s - time.monotonic() if waiting.state == "countdown" else None
+            if waiting.state != "countdown":
+                return None
+            # A command may have cancelled it.
+            goes_on = is_counting_down(self._folder, scan_id)
+            return waiting.starts_s - time.monotonic() if goes_on else 0.0
 
     def _end(self, scan_id: str, waiting: _Waiting, reason: str) -> None:
         waiting.state, waiting.reason = "failed", reason
