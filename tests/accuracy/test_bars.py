@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from bench_fit import fitted, render
 from bench_measure import Table, measured_in, table_of
+from clothes import Garment, with_clothes
 from fit_cases import Case, TestBodies, family_cases, hard_cases
 from fit_report import Row
 from hair import VERDICTS, Hair, with_hair
@@ -124,6 +125,33 @@ def test_hair_is_no_lost_limb(
     height = next(row for row in rows if row.name == "height")
     low, high = height.interval95_m
     assert low < np.ptp(usual.vertices[:, 2]) < high
+
+
+@pytest.mark.parametrize("kind", ["shirt", "shorts"])
+def test_loose_clothes_are_not_the_body(
+    model: BodyModel, bodies: TestBodies, tmp_path: Path, kind: Garment
+) -> None:
+    """A T-shirt made a waist 18 cm wider to +-11 mm, and the scan was usable."""
+    body = bodies.body(1)
+    dressed, _ = with_clothes(model, body, kind, np.random.default_rng(2))
+    bundle = render_bundle(dressed, tmp_path / kind, SimulatedBooth(seed=4))
+    scan = preprocess(read_bundle(bundle))
+    fit = fit_overlapping(model, scan, "joint", lambda _step, _share: None, unobserved)
+    verdict = separate_limbs(model, fit, scan.findings, unobserved).verdict
+    if kind == "shirt":
+        assert verdict.status == "rescan"
+        assert verdict.reasons[0].startswith("loose clothing hides the body")
+        assert {"chest", "abdomen", "pelvis", "upper_arm_left"} <= verdict.missing_parts
+        assert not {"head", "hand_left", "shin_left"} & verdict.missing_parts
+        return
+    assert [note[:21] for note in verdict.notes] == ["clothing at the hips "]
+    errors = scan_errors(model, fit, None)
+    rows = measure_body(model, fit.vertices, fit.surface.sigma_m, None, errors).rows
+    truth = TrueBody(model, body.vertices).values()
+    for row in rows:
+        if row.name in ("hip_girth", "mid_thigh_girth_left", "chest_girth"):
+            low, high = row.interval95_m
+            assert low < truth[row.name] < high
 
 
 def test_nothing_is_lost_unnamed(model: BodyModel, bodies: TestBodies, tmp_path: Path) -> None:

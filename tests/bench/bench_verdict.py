@@ -9,7 +9,8 @@ times: in a pose whose turns are twice those that were drawn for it, with a limb
 reading, and a step off the mark. A limb is lost where the mean distance of its
 vertices from their true places is more than 5 cm, and named where the verdict calls its part
 missing; its rows are then blank. An eighth of the good bodies are scanned again with hair of four
-kinds: a bun, a beard and thick hair are no reasons to scan again, a ponytail on the neck is.
+kinds: a bun, a beard and thick hair are no reasons to scan again, a ponytail on the neck is. As
+many of both families are scanned in six loose garments, which a reason or a remark has to tell.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from clothes import EASES_M, with_clothes
 from fit_cases import TestBodies
 from hair import VERDICTS, with_hair
 from measured_scans import Studio
 from numpy.typing import NDArray
 from room import first_with_room
+from unlike_bodies import UnlikeBodies
+from unlike_sensor import render_unlike
 
 from station.core.bundle import read_bundle
 from station.core.errors import BoothError
@@ -51,6 +55,8 @@ _DARK = (
     ("shin", "foot"), ("thigh", "shin", "foot"), ("foot",),
 )  # fmt: skip
 """Parts that give no reading, in turn on the left and on the right."""
+_CLOTHING = "clothing"
+"""A word of all reasons and remarks on it."""
 _LIMBS = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
 
 
@@ -110,23 +116,28 @@ def is_named(verdict: Verdict, limb: str) -> bool:
     return verdict.status == "rescan" and wanted <= verdict.missing_parts
 
 
-def false_rescans(studio: Studio, bodies: int) -> tuple[int, int]:
-    """Good scans, and those of them that the product asks to take again."""
-    scans, wrong = 0, 0
+def false_rescans(studio: Studio, bodies: int) -> tuple[int, int, int]:
+    """Good scans, those of them that the product asks to take again, and those of bare people that
+    it takes for dressed ones."""
+    scans, wrong, dressed = 0, 0, 0
     for good in (studio.population("test", bodies), studio.unlike("test", bodies // 2)):
         for scan in good:
             scans += 1
-            wrong += scan.fit.verdict.status != "ok"
-            print(f"  {scan.name} {'; '.join(scan.fit.verdict.reasons) or 'ok'}", flush=True)
-    return scans, wrong
+            verdict = scan.fit.verdict
+            words = "; ".join((*verdict.reasons, *verdict.notes))
+            wrong += verdict.status != "ok"
+            dressed += _CLOTHING in words
+            print(f"  {scan.name} {words or 'ok'}", flush=True)
+    return scans, wrong, dressed
 
 
-def _rendered(mesh: Mesh, stem: Path, seed: int) -> Path:
+def _rendered(mesh: Mesh, stem: Path, seed: int, *, unlike: bool = False) -> Path:
     """The bundle of a scan, rendered if it was not before."""
     digest = hashlib.sha256(mesh.vertices.tobytes()).hexdigest()[:12]
     bundle = stem.with_name(f"{stem.name}-{digest}")
     if not bundle.exists():
-        render_bundle(mesh, bundle, SimulatedBooth(seed=seed))
+        render = render_unlike if unlike else render_bundle
+        render(mesh, bundle, SimulatedBooth(seed=seed))
     return bundle
 
 
@@ -174,6 +185,33 @@ def hair_misjudged(model: BodyModel, bodies: int, folder: Path) -> tuple[int, in
     return scans, wrong
 
 
+def clothes_untold(model: BodyModel, bodies: int, folder: Path) -> tuple[int, int, int]:
+    """Scans of dressed bodies, those that are to be taken again, and those of whose clothes neither
+    a reason nor a remark tells."""
+    scans = rescans = untold = 0
+    usual, unlike = TestBodies(), UnlikeBodies(model, "test")
+    wearers = [("family", index, usual.body(index)) for index in range(bodies)]
+    wearers += [("unlike", index, unlike.body(index).mesh) for index in range(bodies)]
+    for family, index, body in wearers:
+        for number, kind in enumerate(EASES_M):
+            rng = np.random.default_rng((_SEED, family == "unlike", index, number))
+            dressed, ease_m = with_clothes(model, body, kind, rng)
+            stem = folder / f"clothes-{family}-{kind}-{index:02d}"
+            bundle = _rendered(dressed, stem, 700 + index, unlike=family == "unlike")
+            verdict = fit_body(model, preprocess(read_bundle(bundle))).verdict
+            words = "; ".join((*verdict.reasons, *verdict.notes))
+            told = _CLOTHING in words
+            scans += 1
+            rescans += verdict.status == "rescan"
+            untold += not told
+            print(
+                f"  {family} {index:02d} {kind}, {100 * ease_m:.0f} cm wider: "
+                f"{'' if told else 'NOT TOLD: '}{verdict.status}: {words}",
+                flush=True,
+            )
+    return scans, rescans, untold
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -190,9 +228,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.scans or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        good, wrong = false_rescans(Studio(model, folder), arguments.bodies)
+        good, wrong, bare = false_rescans(Studio(model, folder), arguments.bodies)
         bad, losses, unnamed, rescans = unnamed_losses(model, (arguments.bodies + 1) // 2, folder)
         hair, misjudged = hair_misjudged(model, (arguments.bodies + 7) // 8, folder)
+        dressed, again, untold = clothes_untold(model, (arguments.bodies + 7) // 8, folder)
     print(f"\nfalse rescans: {wrong} of {good} good scans (bar 0): {_word(wrong)}")
     print(
         f"limbs lost in {losses} of {bad} bad scans, {rescans} of which are to be taken again; "
@@ -201,6 +240,11 @@ def main() -> None:
     print(
         f"heads with hair: {misjudged} of {hair} judged otherwise than they should be (bar 0): "
         f"{_word(misjudged)}"
+    )
+    print(
+        f"loose clothes: not told in {untold} of {dressed} scans (bar 0): {_word(untold)}; "
+        f"{again} are to be taken again; told in {bare} of {good} scans of bare people (bar 0): "
+        f"{_word(bare)}"
     )
 
 

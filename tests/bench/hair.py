@@ -31,14 +31,14 @@ def with_hair(model: BodyModel, body: Mesh, kind: Hair) -> Mesh:
             vertices + _scalp(model, vertices)[:, None] * THICK_M * _outwards(body), body.faces
         )
     if kind == "bun":
-        return _joined([body, sphere(back_of_head + 0.02 * _BACK, 0.045)])
+        return joined([body, sphere(back_of_head + 0.02 * _BACK, 0.045)])
     if kind == "beard":
         chin = vertices[model.landmarks["chin"]]
-        return _joined([body, *(sphere(chin - (0.0, 0.0, down), 0.04) for down in (0.02, 0.06))])
+        return joined([body, *(sphere(chin - (0.0, 0.0, down), 0.04) for down in (0.02, 0.06))])
     nape = vertices[model.landmarks["cervicale"]]
     end = nape + np.array([0.0, 0.06, -0.15])
     shares = np.linspace(0.0, 1.0, 12)[:, None]
-    return _joined(
+    return joined(
         [body, *(sphere(at, 0.03) for at in back_of_head + shares * (end - back_of_head))]
     )
 
@@ -57,7 +57,7 @@ def _outwards(body: Mesh) -> Array:
     return vertex_normals(body.vertices, body.faces)
 
 
-def _joined(meshes: list[Mesh]) -> Mesh:
+def joined(meshes: list[Mesh]) -> Mesh:
     before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

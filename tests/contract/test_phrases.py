@@ -21,7 +21,7 @@ from workers.scape.model.body_model import load_model
 ROOT = Path(__file__).parents[2]
 SPEAKERS = (
     "workers/scape/verdict/verdict.py", "workers/scape/verdict/seen_words.py",
-    "workers/scape/verdict/posture.py",
+    "workers/scape/verdict/posture.py", "workers/scape/verdict/clothes.py",
     "workers/cloud/preprocess.py", "workers/cloud/floor_level.py",
     "workers/reconstruct/job_handle.py", "workers/reconstruct/pool.py",
     "station/booth/collection.py", "station/booth/scan_writer.py", "station/booth/frame_check.py",

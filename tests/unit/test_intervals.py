@@ -99,7 +99,7 @@ def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) 
 def test_hair_around_a_head_widens_what_it_makes_larger(model: BodyModel) -> None:
     """Two centimetres: 2 pi of them to the head's girth, one to the stature, none to the waist."""
     sigma = np.zeros(model.vertex_count)
-    covered = ScanErrors(cover_sigma_m=cover_sigma_m(model, 0.02))
+    covered = ScanErrors(cover_sigma_m=cover_sigma_m(model, {("head",): 0.02}))
     usual, wider = (
         {
             row.name: 0.5 * float(np.diff(row.interval95_m)[0])

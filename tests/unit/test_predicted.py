@@ -23,6 +23,7 @@ from station.simulation.scene import default_rig
 from workers.export.stopwatch import Stopwatch
 from workers.measure.scan_errors import ScanErrors
 from workers.reconstruct import job
+from workers.scape.verdict.clothes import Clothing
 from workers.scape.verdict.unmatched import Patch
 
 SAID = PredictedError(1e-3, 1.5e-3, 0.5e-3, 2e-4)
@@ -112,15 +113,18 @@ def test_a_job_tells_the_measurements(
     monkeypatch.setattr(job, "measure_standing", measure)
     for skin in ("patch_sigma_m", "hidden_head_sigma"):
         monkeypatch.setattr(job, skin, lambda *_: np.zeros(3))
+    monkeypatch.setattr(job, "cover_sigma_m", lambda *_: None)
     monkeypatch.setattr(job, "floor_sigma_m", lambda cloud: cloud.floor_sigma_m)
     surface = SimpleNamespace(sigma_m=np.zeros(3), seen=np.ones(3, bool))
-    patches = Future[tuple[Patch, ...]]()
+    patches, clothing = Future[tuple[Patch, ...]](), Future[list[Clothing]]()
     patches.set_result(())
+    clothing.set_result([])
     fit = SimpleNamespace(
         surface=surface,
         crown_sigma_m=3e-3,
         head_cover_m=0.0,
         patches=patches,
+        clothing=clothing,
         vertices=np.zeros((3, 3)),
         state=None,
         cloud=SimpleNamespace(floor_sigma_m=5e-4, excess_noise_m=2.6e-3),

@@ -16,7 +16,7 @@ from workers.measure.scan_errors import ScanErrors
 from workers.measure.standing import stood_upright
 from workers.measure.tracing import Trace, trace_all
 from workers.scape.model.body_model import FLOOR, BodyModel, BodyState
-from workers.scape.model.deformation import signed_volume, triangle_areas
+from workers.scape.model.deformation import signed_volume, vertex_areas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -139,8 +139,9 @@ def _measured(
         )
     )
     volume = signed_volume(vertices, model.faces)
-    surface = float(triangle_areas(vertices, model.faces).sum())
-    further = scan_errors.of_contents(volume, surface, float(np.ptp(vertices[:, 2])))
+    areas = vertex_areas(vertices, model.faces)
+    surface = float(areas.sum())
+    further = scan_errors.of_contents(volume, areas, float(np.ptp(vertices[:, 2])))
 
     def content(name: str, value: float, its_further: float) -> Content:
         noise_m = scan_errors.excess_noise_m

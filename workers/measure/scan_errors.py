@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,6 @@ Array = NDArray[np.float64]
 NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval over the standard deviation of a normal distribution."""
 _GIRTHS = ("girth", "large girth")
-_COVERED_M2 = 0.08
-"""Area of a head that hair covers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +43,9 @@ class ScanErrors:
     """(P,): the surface beside patches of the scan that it does not explain, and of a head that
     hair hides. No learned gain applies to it; None for none."""
     cover_sigma_m: Array | None = None
-    """(P,): thickness of hair or a cap all around the head; None for none."""
+    """(P,): thickness of what covers the skin all around, hair or cloth; None for nothing."""
 
-    def of_contents(self, volume_m3: float, surface_m2: float, height_m: float) -> Contents:
+    def of_contents(self, volume_m3: float, vertex_areas_m2: Array, height_m: float) -> Contents:
         """Standard deviations of volume and surface, as shares of them.
 
         A girth is off by 2 pi times what the skin is moved by, and a skin that moves by d changes
@@ -54,11 +53,12 @@ class ScanErrors:
         """
         moved_m = self.girth_sigma_m / (2.0 * np.pi)
         stretched = self.height_sigma_m / height_m
-        thicker = surface_m2 * moved_m / volume_m3
-        covered = 0.0 if self.cover_sigma_m is None else float(self.cover_sigma_m.max())
-        hair = _COVERED_M2 * covered / volume_m3
+        thicker = float(vertex_areas_m2.sum()) * moved_m / volume_m3
+        cover_m3 = (
+            0.0 if self.cover_sigma_m is None else float(vertex_areas_m2 @ self.cover_sigma_m)
+        )
         return Contents(
-            float(np.linalg.norm((thicker, stretched, hair))),
+            float(np.linalg.norm((thicker, stretched, cover_m3 / volume_m3))),
             float(np.hypot(0.5 * thicker, stretched)),
         )
 
@@ -93,6 +93,13 @@ def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
     return float(np.sqrt(np.mean(along**2)))
 
 
-def cover_sigma_m(model: BodyModel, thickness_m: float) -> Array:
-    """Standard deviations (P,) of the skin of a head under a cover of at most (95 %) so much."""
-    return np.where(model.of_parts(("head",)), thickness_m / NORMAL_QUANTILE, 0.0)
+def cover_sigma_m(model: BodyModel, covers: Mapping[tuple[str, ...], float]) -> Array | None:
+    """Standard deviations (P,) of the skin under covers; None where there is none.
+
+    Args:
+        covers: parts that are covered -> thickness at most (95 %), metres.
+    """
+    thickness_m = np.zeros(model.vertex_count)
+    for parts, at_most_m in covers.items():
+        thickness_m = np.maximum(thickness_m, np.where(model.of_parts(parts), at_most_m, 0.0))
+    return thickness_m / NORMAL_QUANTILE if thickness_m.any() else None

@@ -220,11 +220,13 @@ def scan_errors(
         patch_sigma_m(model, fit.patches.result()),
         hidden_head_sigma(model, fit.surface.seen, fit.crown_sigma_m),
     )
+    covers = {sign.covered: sign.thickness_m for sign in fit.clothing.result()}
+    covers[("head",)] = fit.head_cover_m
     errors = ScanErrors(
         crown_sigma_m=fit.crown_sigma_m,
         excess_noise_m=fit.cloud.excess_noise_m,
         skin_sigma_m=skin,
-        cover_sigma_m=cover_sigma_m(model, fit.head_cover_m) if fit.head_cover_m else None,
+        cover_sigma_m=cover_sigma_m(model, covers),
     )
     if predicted is None:
         return replace(errors, height_sigma_m=floor_sigma_m(fit.cloud))

@@ -31,6 +31,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.halves import started
 from workers.scape.surface.displacement import SurfaceFit, fit_surface
 from workers.scape.surface.intersections import untangled
+from workers.scape.verdict.clothes import Clothing, clothing_remarks, clothing_signs, is_worn
 from workers.scape.verdict.hair import Hair, hair_of, head_cover_m
 from workers.scape.verdict.posture import (
     arms_inside,
@@ -113,6 +114,8 @@ class OverlappingFit:
     """Thickness at most (95 %) of hair or a cap all around the head."""
     patches: Future[tuple[Patch, ...]]
     """Patches of the scan that the surface does not explain, which are searched for meanwhile."""
+    clothing: Future[list[Clothing]]
+    """Signs of clothing, which are searched for meanwhile."""
     cloud: PointCloud
     correspondences: int
     iterations: int
@@ -182,9 +185,8 @@ def fit_overlapping(
         progress("surface", 0.0)
         cloud = cameras.corrected(cloud)
         surface = fit_surface(model, reference, cloud, scan.views, cameras.poses(scan.views))
-    poses = cameras.poses(scan.views)
     crown_sigma = crown_sigma_m(
-        model, scan.views, poses, surface.vertices, cloud.points, surface.seen
+        model, scan.views, cameras.poses(scan.views), surface.vertices, cloud.points, surface.seen
     )
     return OverlappingFit(
         state=state,
@@ -195,6 +197,7 @@ def fit_overlapping(
         head_cover_m=head_cover_m(model, surface.vertices, reference, state.rotations),
         # Only intervals and verdict need these: whoever separates limbs does not wait for them.
         patches=started(unmatched_patches, model, surface.vertices, cloud),
+        clothing=started(clothing_signs, model, reference, state.rotations, surface, cloud),
         cloud=cloud,
         correspondences=used,
         iterations=iterations,
@@ -243,11 +246,15 @@ def separate_limbs(
     patches = fit.patches.result()
     # What lies beside the head may be an arm that was not found.
     hair = Hair() if arms else hair_of(model, patches, fit.surface.vertices, fit.cloud)
-    lost, remarks = lost_parts(model, patches, hair), hair_remarks(hair, fit.head_cover_m)
-    stature_m = float(np.ptp(vertices[:, 2]))
+    lost = lost_parts(model, patches, hair)
+    signs = fit.clothing.result()
+    worn = signs if is_worn(signs, lost) else ()
+    remarks = [*hair_remarks(hair, fit.head_cover_m), *clothing_remarks(signs)]
     sides = sides_seen(model, vertices, surface.seen)
-    beta, shifts = fit.state.beta, fit.camera_shifts_m
-    verdict = judge(parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced, remarks)
+    stature_m, beta, shifts = np.ptp(vertices[:, 2]), fit.state.beta, fit.camera_shifts_m
+    verdict = judge(
+        parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced, remarks, worn
+    )
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})
     return FitResult(

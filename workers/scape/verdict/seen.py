@@ -51,7 +51,7 @@ def report_parts(
     """
     areas = vertex_areas(vertices, model.faces)
     normals = vertex_normals(vertices, model.faces)
-    points, directions = _thinned(cloud, _POINTS_FOR_PARTS)
+    points, directions = thinned(cloud, _POINTS_FOR_PARTS)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     offsets = points - vertices[vertex]
     away = np.abs(np.einsum("ni,ni->n", offsets, normals[vertex]))
@@ -87,14 +87,14 @@ def sides_seen(model: BodyModel, vertices: Array, seen: NDArray[np.bool_]) -> di
 
 def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> float:
     """Share of the points farther than 3 cm from the surface: a lost limb, a second person."""
-    points, directions = _thinned(cloud, _POINTS_FOR_STARTS)
+    points, directions = thinned(cloud, _POINTS_FOR_STARTS)
     normals = vertex_normals(vertices, model.faces)
     vertex = OrientedTree.build(vertices, normals).nearest(points, directions)
     away = np.linalg.norm(points - vertices[vertex], axis=1)
     return float(np.mean(away > _UNEXPLAINED_M))
 
 
-def _thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
+def thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
     every = slice(None, None, max(1, len(cloud.points) // count))
     return cloud.points[every], cloud.normals[every]
 

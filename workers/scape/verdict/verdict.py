@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from station.core.words.terms import part_in_words
 from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
+from workers.scape.verdict.clothes import Clothing, clothing_reasons
 from workers.scape.verdict.hair import Hair
 from workers.scape.verdict.seen import TRUNK, PartReport, named_parts
 from workers.scape.verdict.seen_words import little_seen, many_hardly_seen
@@ -72,7 +73,8 @@ class Verdict:
     """"ok" or "rescan"."""
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    """Remarks, which do not ask for another scan: on hair, and on cameras that moved a little."""
+    """Remarks, which do not ask for another scan: on hair, on what may be clothing, and on cameras
+    that moved a little."""
     missing: tuple[str, ...] = ()
     """Parts that were not seen or that do not match the scan: nothing can be measured there. A hand
     stands for its thumb and fingers; `FLOOR` is one of them."""
@@ -99,6 +101,7 @@ def judge(
     rms_m: float,
     misplaced: Mapping[str, str] = _NONE,
     remarks: Sequence[str] = (),
+    clothing: Sequence[Clothing] = (),
 ) -> Verdict:
     """Decide whether to scan again.
 
@@ -110,20 +113,22 @@ def judge(
         camera_shifts_m: how far the fit moved each camera's points; empty for a bare cloud.
         rms_m: distance of the points from the surface.
         misplaced: what `head_turned`, `arms_inside`, `feet_cut_off` and `head_cut_off` give.
-        remarks: what `hair_remarks` gives; told with a scan that can be used.
+        remarks: on hair and clothing; told with a scan that can be used.
+        clothing: signs of clothing that hides the body, and explains what does not match there.
     """
     cameras = bool(camera_shifts_m)
     unseen = _unseen_parts(parts, cameras=cameras)
     moved, of_cameras = _moved_cameras(camera_shifts_m)
     halves = _unseen_sides(sides, cameras=cameras)
+    hidden = dict.fromkeys(part for sign in clothing for part in sign.covered)
+    lost = {part: reason for part, reason in lost.items() if part not in hidden}
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
     stature = _stature_of_nobody(stature_m)
     # A person without feet or head is short for that reason, which comes first.
     cut = stature_m < _STATURES_M[0] and any(part.startswith(_UPRIGHT) for part in (*lost, *unseen))
     reasons = [finding.message for finding in findings] + moved + ([] if cut else stature)
-    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
-        reasons.append("what stands in the booth does not look like a person")
+    reasons += [*_nobody(beta), *clothing_reasons(clothing)]
     if everywhere:
         reasons.append(_NO_BODY if cameras else f"{_NO_BODY}; {_ON_ITS_HEAD}")
     # What lies beside a body whose arm or head was not found may be that.
@@ -137,15 +142,27 @@ def judge(
     if any(finding.code == TWO_PEOPLE for finding in findings):
         # What does not match a body, or does not look like one, comes of it.
         reasons = [finding.message for finding in findings]
-    if not reasons and rms_m > _SCATTER_M:
-        remedy = "run: station check" if cameras else "clean the cloud, or scan again"
-        reasons.append(f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}")
+    reasons = reasons or _scattered(rms_m, cameras=cameras)
     again = bool(reasons)
     notes = of_cameras if again else [*remarks, *of_cameras]
     missing = _missing(
-        parts, findings, lost, unseen, halves, cameras=cameras, again=again, everywhere=everywhere
-    )
+        parts, findings, lost, unseen, halves, hidden, cameras=cameras, again=again,
+        everywhere=everywhere,
+    )  # fmt: skip
     return Verdict("rescan" if again else "ok", tuple(reasons), tuple(notes), missing)
+
+
+def _nobody(beta: Array) -> list[str]:
+    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) < _MAX_BETA:
+        return []
+    return ["what stands in the booth does not look like a person"]
+
+
+def _scattered(rms_m: float, *, cameras: bool) -> list[str]:
+    if rms_m < _SCATTER_M:
+        return []
+    remedy = "run: station check" if cameras else "clean the cloud, or scan again"
+    return [f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}"]
 
 
 def _stature_of_nobody(stature_m: float) -> list[str]:
@@ -258,6 +275,7 @@ def _missing(
     lost: Mapping[str, str],
     unseen: Mapping[str, str],
     halves: Sequence[str],
+    hidden: Iterable[str],
     *,
     cameras: bool,
     again: bool,
@@ -269,6 +287,7 @@ def _missing(
         lost: reasons by the part that does not match the scan or was misplaced.
         unseen: what `_unseen_parts` gives.
         halves: what `_unseen_sides` gives.
+        hidden: parts that clothing hides.
         again: the scan is to be taken again.
         everywhere: the body was fitted to something else.
     """
@@ -286,7 +305,7 @@ def _missing(
         missing += [
             part.name for part in parts if part.name in TRUNK or part.coverage < _HALF_COVERAGE
         ]
-    return tuple(dict.fromkeys(missing))
+    return tuple(dict.fromkeys((*missing, *hidden)))
 
 
 def _with_rest_of_limbs(
