@@ -215,7 +215,7 @@ def test_a_move_that_the_view_shows_only_roughly_is_not_told_as_none() -> None:
     turned = CameraMove("a", np.array([0, 0, 0.01, 0.05, 0, 0]), rough, 1.0)
     assert turned.words().endswith(": by about 0.6 degrees (mostly clockwise)")
     shifted = CameraMove("a", np.array([0, 0, 0, 0.05, 0, -0.009]), rough, 1.0)
-    assert shifted.words().endswith(": by about 9 mm (mostly back)")
+    assert shifted.words().endswith(": by about 9 mm (mostly backward)")
 
 
 def test_slopes_hold_beside_gaps() -> None:
