@@ -26,7 +26,8 @@ def test_a_view_that_is_slow_says_so(page: Page, console: LiveConsole) -> None:
 def test_a_narrow_screen_cuts_nothing_off(
     page: Page, console: LiveConsole, scans: list[dict[str, Any]]
 ) -> None:
-    """Names of downloads were outside a telephone's screen, and so were dates and verdicts."""
+    """Names of downloads were outside a telephone's screen, and so were dates and verdicts,
+    intervals, and how much two scans differ."""
     page.set_viewport_size({"width": 390, "height": 780})
     open_view(page, console, "booth")
     _inside(page, ".camera .chip", ".camera")
@@ -35,7 +36,13 @@ def test_a_narrow_screen_cuts_nothing_off(
     open_view(page, console, "scan")
     give_up_a_scan(page)
     _inside(page, "#verdict h2", "#stage")
+    compared = "/".join(scan["scan_id"] for scan in scans)
+    open_view(page, console, f"compare/{compared}")
+    _inside(page, "#compared td", ".table-scroll")
+    page.locator("#main").evaluate("main => main.scrollTo(0, 9999)")
     open_view(page, console, f"result/{scans[0]['scan_id']}")
+    _inside(page, "#rows td", ".table-scroll")
+    assert page.locator("#main").evaluate("main => main.scrollTop") == 0
     page.click("#download", timeout=LONG_MS)
     _inside(page, "#downloads a", "#main")
     page.keyboard.press("Escape")

@@ -96,6 +96,7 @@ async function show({ again = false } = {}) {
     if (mine !== turn) { left(); return; }
     clearTimeout(waiting);
     main.replaceChildren(place);
+    if (!again) main.scrollTop = 0; // of the view before
     leave = left;
   } catch (error) {
     clearTimeout(waiting);

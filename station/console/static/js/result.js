@@ -112,11 +112,12 @@ export async function result(main, session, scanId) {
     menu.hidden = !menu.hidden;
     opener.setAttribute('aria-expanded', String(!menu.hidden));
   } }, t('result.download'));
+  main.className = 'filled';
   main.replaceChildren(
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, scan.label || t('result.noLabel')),
       h('span', { className: 'small soft' }, `${time(scan.created)} · ${scan.scan_id}`)), verdictChip(scan), h('span', { className: 'grow' }),
       print, h('div', { className: 'menu' }, opener, menu)),
-    scan.reasons.length ? h('div', { className: 'banner warn' }, `${t('result.remarks')}: ${said(scan.reasons.join('; '))}`) : '',
+    scan.reasons.length ? h('div', { className: 'banner warn' }, t(scan.state === 'rescan' ? 'result.reasons' : 'result.remarks', { words: said(scan.reasons.join('; ')) })) : '',
     h('div', { className: 'result' }, place,
       h('section', { className: 'card table-card' },
         h('div', { className: 'bar' }, table.pose, table.unit, note),
