@@ -109,3 +109,15 @@ def test_a_log_out_that_does_not_arrive_is_told(page: Page) -> None:
     page.unroute("**/session")
     page.click("#logout")
     expect(page.locator("#password")).to_be_visible(timeout=LONG_MS)
+
+
+def test_who_skips_the_rail_stays_in_the_view(page: Page, console: LiveConsole) -> None:
+    """The link led to the view of scans, from every other one."""
+    open_view(page, console, "history")
+    expect(page.locator("#search")).to_be_visible(timeout=LONG_MS)
+    page.focus("#skip")
+    page.keyboard.press("Enter")
+    expect(page.locator("#main")).to_be_focused()
+    page.keyboard.press("Tab")
+    expect(page.locator("#search")).to_be_focused()
+    assert page.url.endswith("#/history")

@@ -138,6 +138,8 @@ listen((kind) => {
 });
 // Not the first view, whose address is given after it was shown: it may be in use.
 window.addEventListener('hashchange', () => { if (failed || String(wanted().flat()) !== shown) show(); });
+// Its address would be a view's.
+document.getElementById('skip').addEventListener('click', (event) => { event.preventDefault(); main.focus(); });
 window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
 VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for
