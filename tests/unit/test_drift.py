@@ -345,6 +345,19 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     assert (last["moved"], last["changed"]) == ([], ["a"])
 
 
+def test_a_check_keeps_how_a_camera_moved(tmp_path: Path) -> None:
+    """One whose view was covered was told as moved, on the page; of no move it said how far."""
+    sure = 1e-8 * np.eye(6)
+    pushed = CameraMove("a", np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]), sure, 1.0)
+    covered = CameraMove("b", np.zeros(6), sure, 0.05)
+    keep_check(tmp_path, [pushed, covered, CameraMove("c", np.zeros(6), sure, 1.0)])
+    last = last_check(tmp_path)
+    assert last is not None
+    assert last["moves"] == [pushed.words(), covered.words()]
+    assert "20 mm (mostly to the right)" in last["moves"][0]
+    assert "something stands in its way" in last["moves"][1]
+
+
 def _rig(names: str, serial: str = "") -> Rig:
     cameras = {name: replace(CAMERA, name=name, serial=serial) for name in names}
     return replace(default_rig(), cameras=cameras, reference=names[0])

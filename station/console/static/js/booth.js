@@ -61,7 +61,7 @@ export async function booth(main) {
 
   function checked(last) {
     const parts = [];
-    if (last.moved.length) parts.push(t('booth.checkMoved', { names: last.moved.join(', ') }));
+    if (last.moved.length) parts.push(t('booth.checkMoved', { moves: said(last.moves.join('; ')) }));
     if (last.changed.length) parts.push(t('booth.checkChanged', { names: last.changed.join(', ') }));
     if (!parts.length) parts.push(t('booth.checkGood'));
     if (last.depths) parts.push(said(last.depths));
