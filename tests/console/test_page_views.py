@@ -27,10 +27,13 @@ def test_a_narrow_screen_cuts_nothing_off(
     page: Page, console: LiveConsole, scans: list[dict[str, Any]]
 ) -> None:
     """Names of downloads were outside a telephone's screen, and so were dates and verdicts,
-    intervals, and how much two scans differ."""
+    intervals, and how much two scans differ. What a step of the calibration says was above it."""
     page.set_viewport_size({"width": 390, "height": 780})
     open_view(page, console, "booth")
     _inside(page, ".camera .chip", ".camera")
+    open_view(page, console, "calibration")
+    page.click("[data-step=solve]", timeout=LONG_MS)
+    expect(page.locator("#now h2")).to_be_in_viewport(timeout=LONG_MS)
     open_view(page, console, "history")
     _inside(page, "[data-scan] .chip, [data-scan] .danger", ".history")
     open_view(page, console, "scan")
