@@ -4,7 +4,8 @@ import { get, post, freshKey } from './api.js';
 import { Cameras } from './cameras.js';
 import { h, notice } from './dom.js';
 import { listen } from './events.js';
-import { said, t, time } from './i18n.js';
+import { t, time } from './i18n.js';
+import { withViews as said } from './remedies.js';
 import { troubleBanner } from './troubles.js';
 
 const REFRESH_MS = 5000;

@@ -3,8 +3,9 @@
 import { address, bytes, get, reached } from './api.js';
 import { emptyWhenGone } from './deleted.js';
 import { h, press, segmented } from './dom.js';
-import { currentLanguage, outcome, said, t, time } from './i18n.js';
+import { currentLanguage, outcome, t, time } from './i18n.js';
 import { readPly } from './ply.js';
+import { withViews as said } from './remedies.js';
 import { digits, settings } from './settings.js';
 import { switches } from './switches.js';
 

@@ -5,7 +5,8 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { isLost, listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { outcome, said, t, time } from './i18n.js';
+import { outcome, t, time } from './i18n.js';
+import { withViews as said } from './remedies.js';
 import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
