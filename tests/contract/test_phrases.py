@@ -182,9 +182,8 @@ def test_no_sentence_has_two_translations() -> None:
     assert in_language("the cameras saw only 9 % of the person's back", "zh") == (
         "相机只看到人体背面的 9 %"
     )
-    assert in_language(f"camera a has moved since it was calibrated: {move_words(_BACK)}", "zh") == (
-        "相机 a 自校准以来移动了：约 9 毫米（主要向后）"
-    )
+    moved = f"camera a has moved since it was calibrated: {move_words(_BACK)}"
+    assert in_language(moved, "zh") == "相机 a 自校准以来移动了：约 9 毫米（主要向后）"
 
 
 def test_sentences_are_said_in_chinese() -> None:

@@ -65,9 +65,7 @@ class Check(BaseModel):
     """The last comparison of the empty booth with its calibration."""
 
     time: str
-    moved: list[str] = Field(
-        description="cameras that have moved, or no longer see what they saw"
-    )
+    moved: list[str] = Field(description="cameras that have moved, or no longer see what they saw")
     moves: list[str] = Field(description="words on each of them")
     changed: list[str] = Field(
         description="cameras whose view looks too different to tell small moves"
