@@ -58,7 +58,7 @@ _WORDS: dict[Language, dict[str, str]] = {
            "standard": "标准姿势", "value": "数值", "l": "左", "r": "右",
            "difference": "左 - 右",
            "note": "± 为 95 % 区间的一半。线条画在扫描姿势下的测量位置。粗体的左右差值超出其区间。",
-           "unlabelled": "无订单"},
+           "unlabelled": "无标签"},
 }  # fmt: skip
 _LATIN, _BOLD, _CHINESE, _OTHER = "Helvetica", "Helvetica-Bold", "STSong-Light", "Other"
 _OTHER_FILES = (

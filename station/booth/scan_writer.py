@@ -240,9 +240,7 @@ class ScanWriter:
             if look is not None:
                 looks[name] = look
         changed, moves = compared(looks, self._names)
-        self._remarks = []
-        if changed and not changed.too_large:
-            self._remarks = [(rig.created, changed.words())]
+        self._remarks = [(rig.created, changed.words())] if changed else []
         moved: list[CameraMove] = []
         for move in moves:
             if self._drift.confirmed(move):

@@ -6,6 +6,7 @@ page_in_browser.py has every other view and what goes wrong; `make test-console`
 from __future__ import annotations
 
 import os
+import re
 import signal
 
 import pytest
@@ -106,6 +107,30 @@ def test_a_scan_is_followed_though_its_view_was_left(fresh: Page, console: LiveC
         expect(fresh.locator("#stage h2")).to_have_text("left", timeout=LONG_MS)
     fresh.click("#give-up")
     expect(fresh.locator("#verdict h2")).to_have_text("The scan was cancelled", timeout=LONG_MS)
+
+
+def test_a_scan_is_followed_by_a_page_that_is_loaded_anew(
+    fresh: Page, console: LiveConsole
+) -> None:
+    """The page asked whose scan to take, and no button ended the countdown."""
+    fresh.route("**/api/v1/session", _count_longer)
+    log_in(fresh, console)
+    open_view(fresh, console, "scan")
+    fresh.fill("#label", "anew")
+    fresh.click("#go", timeout=LONG_MS)
+    expect(fresh.locator("#stage h2")).to_have_text("anew", timeout=LONG_MS)
+    fresh.reload()
+    expect(fresh.locator("#stage h2")).to_have_text("anew", timeout=LONG_MS)
+    expect(fresh.locator(".ring .number")).to_have_text(re.compile(r"\d"), timeout=LONG_MS)
+    # Another window of the browser is another operator's.
+    other = fresh.context.new_page()
+    open_view(other, console, "scan")
+    expect(other.locator("#label")).to_be_visible(timeout=LONG_MS)
+    other.close()
+    fresh.click("#give-up")
+    expect(fresh.locator("#verdict h2")).to_have_text("The scan was cancelled", timeout=LONG_MS)
+    fresh.reload()
+    expect(fresh.locator("#label")).to_be_visible(timeout=LONG_MS)
 
 
 def test_a_scan_that_was_deleted_while_its_view_was_left_is_not_followed(

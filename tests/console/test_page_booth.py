@@ -7,13 +7,16 @@ import shutil
 import signal
 import time
 
+import numpy as np
 import pytest
 from console_page import LONG_MS, open_view
 from live_console import LiveConsole
 from playwright.sync_api import Page, Route, expect
 
+from station.calibration.drift.last_check import keep_check
 from station.calibration.guide.session import Session
 from station.calibration.guide.store import UNFINISHED
+from station.calibration.moves.motion import CameraMove
 from station.core.rig import Rig
 
 pytestmark = pytest.mark.usefixtures("sensors")
@@ -139,3 +142,19 @@ def test_a_calibration_that_was_begun_is_shown_and_not_lost_by_a_touch(
             assert client.get("/calibration").json()["done"] == ["floor"]
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def test_a_check_says_how_a_camera_moved(page: Page, console: LiveConsole) -> None:
+    """A camera with a coat before it was told as moved, and of no move it was said how far."""
+    sure, pushed = 1e-8 * np.eye(6), np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0])
+    keep_check(
+        console.config.console.folder,
+        [CameraMove("a", pushed, sure, 1.0), CameraMove("b", np.zeros(6), sure, 0.05)],
+    )
+    open_view(page, console, "booth")
+    told = page.locator("section", has=page.locator("#check"))
+    expect(told).to_contain_text("20 mm (mostly to the right)", timeout=LONG_MS)
+    expect(told).to_contain_text("something stands in its way")
+    page.select_option("#language", "zh")
+    expect(told).to_contain_text("约 20 毫米（主要向右）", timeout=LONG_MS)
+    expect(told).to_contain_text("有东西挡住了它")

@@ -75,3 +75,18 @@ def test_a_table_that_does_not_come_moves_no_switch(
     page.get_by_role("button", name="As scanned").click()
     expect(standard).to_have_attribute("aria-pressed", "false", timeout=LONG_MS)
     assert float(waist.inner_text()) == pytest.approx(float(before) / 2.54, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("state", "words"), [("delivered", "Remarks: "), ("rescan", "Scan again: ")]
+)
+def test_what_is_said_of_a_result_covers_no_button(
+    page: Page, console: LiveConsole, scans: list[dict[str, Any]], state: str, words: str
+) -> None:
+    """A remark pushed the buttons below the body out of a tablet's screen, and reasons to scan
+    again were told as remarks."""
+    scan = {**scans[0], "state": state, "reasons": ["the person leans by 9 degrees: stand upright"]}
+    page.route(f"**/scans/{scan['scan_id']}", lambda route: route.fulfill(json=scan))
+    open_view(page, console, f"result/{scan['scan_id']}")
+    expect(page.locator(".banner")).to_have_text(f"{words}{scan['reasons'][0]}", timeout=LONG_MS)
+    expect(page.get_by_role("button", name="Front")).to_be_in_viewport(ratio=1.0, timeout=LONG_MS)

@@ -26,16 +26,26 @@ def test_a_view_that_is_slow_says_so(page: Page, console: LiveConsole) -> None:
 def test_a_narrow_screen_cuts_nothing_off(
     page: Page, console: LiveConsole, scans: list[dict[str, Any]]
 ) -> None:
-    """Names of downloads were outside a telephone's screen, and so were dates and verdicts."""
+    """Names of downloads were outside a telephone's screen, and so were dates and verdicts,
+    intervals, and how much two scans differ. What a step of the calibration says was above it."""
     page.set_viewport_size({"width": 390, "height": 780})
     open_view(page, console, "booth")
     _inside(page, ".camera .chip", ".camera")
+    open_view(page, console, "calibration")
+    page.click("[data-step=solve]", timeout=LONG_MS)
+    expect(page.locator("#now h2")).to_be_in_viewport(timeout=LONG_MS)
     open_view(page, console, "history")
     _inside(page, "[data-scan] .chip, [data-scan] .danger", ".history")
     open_view(page, console, "scan")
     give_up_a_scan(page)
     _inside(page, "#verdict h2", "#stage")
+    compared = "/".join(scan["scan_id"] for scan in scans)
+    open_view(page, console, f"compare/{compared}")
+    _inside(page, "#compared td", ".table-scroll")
+    page.locator("#main").evaluate("main => main.scrollTo(0, 9999)")
     open_view(page, console, f"result/{scans[0]['scan_id']}")
+    _inside(page, "#rows td", ".table-scroll")
+    assert page.locator("#main").evaluate("main => main.scrollTop") == 0
     page.click("#download", timeout=LONG_MS)
     _inside(page, "#downloads a", "#main")
     page.keyboard.press("Escape")
@@ -102,3 +112,15 @@ def test_a_log_out_that_does_not_arrive_is_told(page: Page) -> None:
     page.unroute("**/session")
     page.click("#logout")
     expect(page.locator("#password")).to_be_visible(timeout=LONG_MS)
+
+
+def test_who_skips_the_rail_stays_in_the_view(page: Page, console: LiveConsole) -> None:
+    """The link led to the view of scans, from every other one."""
+    open_view(page, console, "history")
+    expect(page.locator("#search")).to_be_visible(timeout=LONG_MS)
+    page.focus("#skip")
+    page.keyboard.press("Enter")
+    expect(page.locator("#main")).to_be_focused()
+    page.keyboard.press("Tab")
+    expect(page.locator("#search")).to_be_focused()
+    assert page.url.endswith("#/history")

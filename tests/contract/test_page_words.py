@@ -65,7 +65,8 @@ def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
     states += [{**well, "problems": [*late, *problems]}, {**well, "problems": late[:1]}]
     states += [{**well, "remarks": problems}, {**well, "remarks": problems, "disk_free_mb": 1}]
     said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
-    assert said[:2] == [[], [in_language(text, "zh") for text in problems]]
+    calibrate = "扫描室尚未校准，不能扫描：请运行 “校准”"
+    assert said[:2] == [[], [in_language(problems[0], "zh"), calibrate]]
     assert said[2] == ["扫描站没有响应："]
     # Three failing hand-overs filled the view that a scan is taken in.
     first = in_language(late[0], "zh")
@@ -87,6 +88,20 @@ def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> No
         "with station calibrate --use 20261120T100000Z": "with “Use” 20261120T100000Z",
     }
     said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
+    assert said == list(texts.values())
+
+
+def test_commands_are_buttons_and_views_wherever_there_are_some(tmp_path: Path) -> None:
+    """A camera that had moved was to be checked in a terminal, by whoever has but a tablet."""
+    texts = {
+        "put the camera back and run station check, or run station calibrate": "put the camera "
+        "back and run “Check now”, or run “Calibrate”",
+        "run station check --correct": "run station check --correct",
+        "with station calibrate --use 20261120T100000Z (--list shows all)": "with station "
+        "calibrate --use 20261120T100000Z (--list shows all)",
+        "run station calibrate mark": "run station calibrate mark",
+    }
+    said = _on_the_page(tmp_path, "remedies.js", "withViews", list(texts), "en")
     assert said == list(texts.values())
 
 

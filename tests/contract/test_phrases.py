@@ -8,12 +8,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from spoken import SPOKEN
 
 from station.archive.phrases import PHRASES, in_language, untranslated
 from station.calibration.detect.coverage import Coverage
 from station.calibration.guide.steps import _rest_line, _wave_line
+from station.calibration.moves.motion import move_words
 from station.core.words.terms import part_in_words
 from station.simulation.scene import default_rig
 from workers.scape.model.body_model import load_model
@@ -70,6 +72,8 @@ COMMANDS = re.compile(r"(sudo )?(station|systemctl) [a-z -]+|\(.*?\)")
 _SILENT_CALLS = ("log.", "_log.", "click.", "Field", "Query", "audit.note")
 _MIN_WORDS = 3
 _GAP, _GAPS = "7", re.compile(r"\{\w+\}")
+_BACK = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.009])
+"""A move of a camera."""
 
 
 def _template(node: ast.AST) -> str | None:
@@ -169,6 +173,17 @@ def test_gaps_of_both_languages_are_the_same() -> None:
     for english, chinese in json.loads(PHRASES.read_text()).items():
         assert sorted(re.findall(r"\{\w+\}", english)) == sorted(re.findall(r"\{\w+\}", chinese))
         assert re.search("[\u4e00-\u9fff（：]", chinese)
+
+
+def test_no_sentence_has_two_translations() -> None:
+    """The later one held: a person's back was "backward", as a camera moves."""
+    english = [one for one, _ in json.loads(PHRASES.read_text(), object_pairs_hook=list)]
+    assert len(english) == len(set(english))
+    assert in_language("the cameras saw only 9 % of the person's back", "zh") == (
+        "相机只看到人体背面的 9 %"
+    )
+    moved = f"camera a has moved since it was calibrated: {move_words(_BACK)}"
+    assert in_language(moved, "zh") == "相机 a 自校准以来移动了：约 9 毫米（主要向后）"
 
 
 def test_sentences_are_said_in_chinese() -> None:

@@ -20,7 +20,7 @@ from station.calibration.drift.last_check import last_check
 from station.core.kinect_v1 import DEPTH_SCALE_M, TABLE
 from station.core.rig import Rig
 from station.sensors.recording import write_recording
-from station.simulation.scene import Mesh, bumped, fixed_posts, load_mesh
+from station.simulation.scene import Mesh, bumped, default_rig, fixed_posts, load_mesh
 from station.simulation.sensor import TICK_HZ, SimulatedBooth, VirtualCamera, recorded_frames
 
 STATION = (sys.executable, "-m", "station.cli")
@@ -129,13 +129,7 @@ def test_a_scan_by_warmer_sensors_is_corrected(
 ) -> None:
     """Girths were 7 mm too small for 0.1 %, stated to 3, and nothing was said."""
     rig = Rig.load(calibrated / "calibration.json")
-    for name in rig.cameras:
-        _record(tmp_path / "warm" / name, load_mesh(BODY), {}, warmth=2e-3)
-    station = make_station(
-        "[workers]\ncount = 0",
-        lambda text: _recorded(text).replace(f"{booth}/", f"{tmp_path}/warm/"),
-    )
-    assert station.command("start").returncode == 0
+    station = _warmer(make_station, booth, tmp_path, 2e-3)
     done = station.command("scan", "--no-wait")
     assert done.returncode == 0, done.stderr
     [scan] = (station.config.parent / "spool/queue").iterdir()
@@ -150,3 +144,29 @@ def test_a_scan_by_warmer_sensors_is_corrected(
     kept = last_check(station.config.parent / "console")
     assert kept is not None
     assert "farther away" in kept["depths"]
+
+
+def test_sensors_too_warm_for_scans_are_told_after_one_was_refused(
+    make_station: Callable[..., Station], booth: Path, calibrated: Path, tmp_path: Path
+) -> None:
+    """A booth that was told to be warmer was not any more when it was too warm."""
+    assert calibrated.exists()
+    station = _warmer(make_station, booth, tmp_path, 8e-3)
+    done = station.command("scan", "--no-wait")
+    assert done.returncode == 1
+    for words in (done.stderr, station.command("status").stdout):
+        assert "all cameras see everything farther away" in words, words
+
+
+def _warmer(
+    make_station: Callable[..., Station], booth: Path, folder: Path, warmth: float
+) -> Station:
+    """A booth whose sensors are warmer than when they were calibrated, switched on."""
+    for name in default_rig().cameras:
+        _record(folder / "warm" / name, load_mesh(BODY), {}, warmth=warmth)
+    station = make_station(
+        "[workers]\ncount = 0",
+        lambda text: _recorded(text).replace(f"{booth}/", f"{folder}/warm/"),
+    )
+    assert station.command("start").returncode == 0
+    return station

@@ -215,7 +215,7 @@ def test_a_move_that_the_view_shows_only_roughly_is_not_told_as_none() -> None:
     turned = CameraMove("a", np.array([0, 0, 0.01, 0.05, 0, 0]), rough, 1.0)
     assert turned.words().endswith(": by about 0.6 degrees (mostly clockwise)")
     shifted = CameraMove("a", np.array([0, 0, 0, 0.05, 0, -0.009]), rough, 1.0)
-    assert shifted.words().endswith(": by about 9 mm (mostly back)")
+    assert shifted.words().endswith(": by about 9 mm (mostly backward)")
 
 
 def test_slopes_hold_beside_gaps() -> None:
@@ -343,6 +343,19 @@ def test_a_check_of_a_booth_that_looks_different_is_not_kept_as_good(tmp_path: P
     last = last_check(tmp_path)
     assert last is not None
     assert (last["moved"], last["changed"]) == ([], ["a"])
+
+
+def test_a_check_keeps_how_a_camera_moved(tmp_path: Path) -> None:
+    """One whose view was covered was told as moved, on the page; of no move it said how far."""
+    sure = 1e-8 * np.eye(6)
+    pushed = CameraMove("a", np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]), sure, 1.0)
+    covered = CameraMove("b", np.zeros(6), sure, 0.05)
+    keep_check(tmp_path, [pushed, covered, CameraMove("c", np.zeros(6), sure, 1.0)])
+    last = last_check(tmp_path)
+    assert last is not None
+    assert last["moves"] == [pushed.words(), covered.words()]
+    assert "20 mm (mostly to the right)" in last["moves"][0]
+    assert "something stands in its way" in last["moves"][1]
 
 
 def _rig(names: str, serial: str = "") -> Rig:

@@ -48,10 +48,12 @@ def test_a_result_is_printed_with_plain_names_and_both_sides_on_a_line(
         _row("calf_girth_left", 0.36, basis="inferred"),
         _row("calf_girth_right", 0.37),
     ]
+    verdict = {"status": "ok", "reasons": [], "notes": ["hair is left out"]}
     document = {"format": "booth-measurements", "version": 1, "measurements": rows}
-    (tmp_path / "measurements.json").write_text(json.dumps(document))
+    (tmp_path / "measurements.json").write_text(json.dumps({**document, "verdict": verdict}))
     show_result(tmp_path)
-    lines = capsys.readouterr().out.splitlines()[1:]
+    remark, _, *lines = capsys.readouterr().out.splitlines()
+    assert remark == "remark: hair is left out"
     heading, waist, _, sides, neck, hand, calf, _, partly, inferred = lines
     assert heading.split() == ["cm", "95", "%", "interval"]
     assert waist.split() == ["Waist", "girth", "84.2", "83.4", "to", "85.0"]

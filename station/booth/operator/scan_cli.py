@@ -242,11 +242,14 @@ def _text(label: str) -> str:
 
 
 def show_result(folder: Path) -> None:
-    """Print a delivered result's table.
+    """Print the remarks on a delivered result, and its table.
 
     Raises:
         FormatError: it cannot be read.
     """
+    document = read_measurements(folder, "as-scanned")
+    for remark in (document.get("verdict") or {}).get("notes", ()):
+        click.echo(f"remark: {remark}")
     click.echo("")
-    for line in printed_table(read_measurements(folder, "as-scanned")):
+    for line in printed_table(document):
         click.echo(f"  {line}".rstrip())

@@ -22,6 +22,7 @@ def keep_check(folder: Path, moves: Sequence[CameraMove], depths: str = "") -> N
     found = {
         "time": utc_now(),
         "moved": [move.camera for move in moves if move.moved or move.lost],
+        "moves": [move.words() for move in moves if move.moved or move.lost],
         "changed": [move.camera for move in moves if move.changed],
         "depths": depths,
     }

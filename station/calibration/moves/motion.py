@@ -53,7 +53,7 @@ _ITERATIONS = 60
 _SCALE = np.array([LEVER_M] * 3 + [1.0] * 3)
 _SIDES = (
     ("up", "down"), ("to the right", "to the left"), ("clockwise", "anticlockwise"),
-    ("to the right", "to the left"), ("down", "up"), ("forward", "back"),
+    ("to the right", "to the left"), ("down", "up"), ("forward", "backward"),
 )  # fmt: skip
 """Directions in which a positive and a negative component of xi turn or shift a camera, as it
 looks."""

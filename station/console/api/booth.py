@@ -309,8 +309,8 @@ def _last_check(console: Console) -> Check | None:
     if check is None:
         return None
     # Earlier versions kept less, in files that may still be there.
-    changed, depths = check.get("changed", []), check.get("depths", "")
-    return Check(time=check["time"], moved=check["moved"], changed=changed, depths=depths)
+    kept = {"moves": check["moved"], "changed": [], "depths": "", **check}
+    return Check(**{name: kept[name] for name in Check.model_fields})
 
 
 def _store(console: Console) -> CalibrationStore:

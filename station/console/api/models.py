@@ -65,7 +65,8 @@ class Check(BaseModel):
     """The last comparison of the empty booth with its calibration."""
 
     time: str
-    moved: list[str]
+    moved: list[str] = Field(description="cameras that have moved, or no longer see what they saw")
+    moves: list[str] = Field(description="words on each of them")
     changed: list[str] = Field(
         description="cameras whose view looks too different to tell small moves"
     )
@@ -88,7 +89,7 @@ class BoothState(BaseModel):
     running: bool
     fault: str = Field(description="why no station answers; empty if one does")
     problems: list[str] = Field(description="what is wrong and what to do, the worst first")
-    remarks: list[str] = Field(description="what scans are corrected for")
+    remarks: list[str] = Field(description="what scans are corrected or refused for")
     can_scan: bool = Field(
         description="nothing is in the way of a scan, other than sensors that are stopped"
     )

@@ -96,6 +96,7 @@ async function show({ again = false } = {}) {
     if (mine !== turn) { left(); return; }
     clearTimeout(waiting);
     main.replaceChildren(place);
+    if (!again) main.scrollTop = 0; // of the view before
     leave = left;
   } catch (error) {
     clearTimeout(waiting);
@@ -137,6 +138,8 @@ listen((kind) => {
 });
 // Not the first view, whose address is given after it was shown: it may be in use.
 window.addEventListener('hashchange', () => { if (failed || String(wanted().flat()) !== shown) show(); });
+// Its address would be a view's.
+document.getElementById('skip').addEventListener('click', (event) => { event.preventDefault(); main.focus(); });
 window.addEventListener('booth-login', () => { if (session) leaveForLogin(); });
 
 VIEWS[wanted()[0]]().catch(() => {}); // on its way while the session is asked for

@@ -4,7 +4,8 @@ import { get, post, freshKey } from './api.js';
 import { Cameras } from './cameras.js';
 import { h, notice } from './dom.js';
 import { listen } from './events.js';
-import { said, t, time } from './i18n.js';
+import { t, time } from './i18n.js';
+import { withViews as said } from './remedies.js';
 import { troubleBanner } from './troubles.js';
 
 const REFRESH_MS = 5000;
@@ -61,7 +62,7 @@ export async function booth(main) {
 
   function checked(last) {
     const parts = [];
-    if (last.moved.length) parts.push(t('booth.checkMoved', { names: last.moved.join(', ') }));
+    if (last.moved.length) parts.push(t('booth.checkMoved', { moves: said(last.moves.join('; ')) }));
     if (last.changed.length) parts.push(t('booth.checkChanged', { names: last.changed.join(', ') }));
     if (!parts.length) parts.push(t('booth.checkGood'));
     if (last.depths) parts.push(said(last.depths));

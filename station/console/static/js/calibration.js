@@ -19,7 +19,10 @@ export async function calibration(main, session) {
   const now = h('section', { className: 'card now', id: 'now', 'aria-live': 'polite' });
   const stored = h('section', { className: 'card' });
   const begin = async (step, fresh = false) => {
-    try { show(await post('/calibration', { step, new: fresh }, { 'Idempotency-Key': freshKey() })); } catch (error) { notice(error.message, true); }
+    try {
+      show(await post('/calibration', { step, new: fresh }, { 'Idempotency-Key': freshKey() }));
+      now.scrollIntoView({ block: 'nearest' }); // the button may be far below, on a telephone
+    } catch (error) { notice(error.message, true); }
   };
   const say = async (word, more = {}) => { try { show(await post('/task/answer', { answer: word, ...more })); } catch (error) { notice(error.message, true); } };
   const halt = async () => { try { show(await remove('/task')); } catch (error) { notice(error.message, true); } };

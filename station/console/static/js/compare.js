@@ -51,6 +51,7 @@ export async function compare(main, session, first, second) {
     }
   }
 
+  main.className = 'filled';
   main.replaceChildren(
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, t('compare.title')), who), h('span', { className: 'grow' }),
       h('a', { className: 'button', href: `#/compare/${second}/${first}` }, t('compare.swap'))),

@@ -1,4 +1,4 @@
-// What the station says of a calibration; the commands that it names are buttons on the page.
+// What the station says; the commands that it names are buttons and views of the page.
 
 import { said, t } from './i18n.js';
 
@@ -11,4 +11,11 @@ export function withButtons(text) {
     const key = word ? word.replace('--', '') : 'continue';
     return t('cal.button', { name: t(`cal.${key}`) });
   });
+}
+
+// In the other views: with a step or an option, a command is the terminal's.
+const ELSEWHERE = /station (check|calibrate)(?! ?-| [a-z(])/g;
+
+export function withViews(text) {
+  return said(text).replace(ELSEWHERE, (_, word) => t('cal.button', { name: t(word === 'check' ? 'booth.checkNow' : 'nav.calibration') }));
 }

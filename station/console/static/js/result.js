@@ -3,8 +3,9 @@
 import { address, bytes, get, reached } from './api.js';
 import { emptyWhenGone } from './deleted.js';
 import { h, press, segmented } from './dom.js';
-import { currentLanguage, outcome, said, t, time } from './i18n.js';
+import { currentLanguage, outcome, t, time } from './i18n.js';
 import { readPly } from './ply.js';
+import { withViews as said } from './remedies.js';
 import { digits, settings } from './settings.js';
 import { switches } from './switches.js';
 
@@ -112,11 +113,12 @@ export async function result(main, session, scanId) {
     menu.hidden = !menu.hidden;
     opener.setAttribute('aria-expanded', String(!menu.hidden));
   } }, t('result.download'));
+  main.className = 'filled';
   main.replaceChildren(
     h('div', { className: 'head' }, h('div', {}, h('h1', {}, scan.label || t('result.noLabel')),
       h('span', { className: 'small soft' }, `${time(scan.created)} · ${scan.scan_id}`)), verdictChip(scan), h('span', { className: 'grow' }),
       print, h('div', { className: 'menu' }, opener, menu)),
-    scan.reasons.length ? h('div', { className: 'banner warn' }, `${t('result.remarks')}: ${said(scan.reasons.join('; '))}`) : '',
+    scan.reasons.length ? h('div', { className: 'banner warn' }, t(scan.state === 'rescan' ? 'result.reasons' : 'result.remarks', { words: said(scan.reasons.join('; ')) })) : '',
     h('div', { className: 'result' }, place,
       h('section', { className: 'card table-card' },
         h('div', { className: 'bar' }, table.pose, table.unit, note),

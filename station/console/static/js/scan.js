@@ -5,7 +5,8 @@ import { Cameras } from './cameras.js';
 import { h, notice, s } from './dom.js';
 import { isLost, listen } from './events.js';
 import { bodyFigure } from './figure.js';
-import { outcome, said, t, time } from './i18n.js';
+import { outcome, t, time } from './i18n.js';
+import { withViews as said } from './remedies.js';
 import { troubleBanner } from './troubles.js';
 
 const AROUND = 2 * Math.PI * 108;
@@ -19,6 +20,24 @@ const TOGETHER_MS = 250;
 let kept = null;
 const underway = ({ asking, current }) => asking !== null || (current !== null && !FINAL.includes(current.state));
 
+// The scan that is under way outlives the page, in its window: a page that was loaded anew asked for
+// the next one, without a word of the person in the booth.
+const UNDERWAY = 'booth.scan';
+function remember(scan) {
+  try {
+    if (scan) sessionStorage.setItem(UNDERWAY, scan.scan_id);
+    else sessionStorage.removeItem(UNDERWAY);
+  } catch { /* a browser that keeps nothing */ }
+}
+
+async function remembered() {
+  let scanId = null;
+  try { scanId = sessionStorage.getItem(UNDERWAY); } catch { /* as above */ }
+  if (!scanId) return null;
+  const current = await get(`/scans/${scanId}`).catch(() => null);
+  return current && { label: current.label, pressed: null, took: null, current, asking: null };
+}
+
 // Of a countdown that is over, nothing but what is heard meanwhile tells the view that is opened again.
 listen((kind, data) => {
   const scan = kept?.current;
@@ -28,6 +47,7 @@ listen((kind, data) => {
 export async function scan(main, session) {
   // Nobody knows how long a scan took whose end was awaited in another view.
   if (kept && !session.again) kept = underway(kept) ? { ...kept, pressed: null } : null;
+  kept ??= await remembered();
   const state = await get('/booth');
   const front = state.cameras.map((camera) => camera.name).filter((name) => name.startsWith('front'));
   const shown = front.length ? front : state.cameras.slice(0, 2).map((camera) => camera.name);
@@ -54,6 +74,7 @@ export async function scan(main, session) {
 
   function ready() {
     current = null;
+    remember(null);
     clearInterval(timer);
     const input = h('input', { type: 'text', id: 'label', value: label, maxLength: session.label_length,
       placeholder: t('scan.placeholder'), autocomplete: 'off', enterKeyHint: 'go',
@@ -107,6 +128,7 @@ export async function scan(main, session) {
 
   function follow(found) {
     current = found;
+    remember(found);
     parts = null;
     clearInterval(timer);
     // Events tell sooner; asking now and then bridges a lost connection.
@@ -204,6 +226,7 @@ export async function scan(main, session) {
 
   function finish() {
     clearInterval(timer);
+    remember(null);
     const done = current;
     if (pressed !== null) took ??= ((performance.now() - pressed) / 1000).toFixed(1);
     const figure = bodyFigure();

@@ -1,7 +1,8 @@
-// What is wrong with the booth, as `station status` says it.
+// What is wrong with the booth, as `station status` says it, with the page's buttons for its commands.
 
 import { h } from './dom.js';
-import { said, t } from './i18n.js';
+import { t } from './i18n.js';
+import { withViews as said } from './remedies.js';
 
 const HAND_OVER = /^deliver /;
 
