@@ -59,7 +59,12 @@ _SCATTER_M = 0.006
 """Rms distance of the readings from the surface that makes a scan unusable: 1.1 to 1.6 mm in 50
 sound scans, up to 4.0 with the paper's surface, 12 where each point is 30 mm off."""
 _NO_BODY = "too much of the scan does not match a body: nothing can be measured"
-_HEAD_REMEDY = "tie up or cover hair that stands off the head"
+_REMEDIES = {
+    "head": "tie up or cover hair that stands off the head",
+    "foot_left": "take shoes off",
+    "foot_right": "take shoes off",
+}
+"""Remedies by the part that does not match the scan."""
 _NECK_HIDDEN = "hair or something worn hides the neck: tie hair up, take scarves and straps off"
 _ON_ITS_HEAD = "if the cloud stands on its head, say which axis points up (--up)"
 _NONE: Mapping[str, str] = MappingProxyType({})
@@ -255,7 +260,8 @@ def lost_parts(
                 f"the {part_in_words(part)} does not match the scan ({size} of it lie "
                 f"{1e3 * patch.distance_m:.0f} mm away)"
             )
-            reasons.setdefault(part, f"{reason}; {_HEAD_REMEDY}" if part == "head" else reason)
+            remedy = _REMEDIES.get(part)
+            reasons.setdefault(part, f"{reason}; {remedy}" if remedy else reason)
     return reasons
 
 
