@@ -10,6 +10,7 @@ Whoever removes it, the console at the end or control for a cancel, decides if t
 
 from __future__ import annotations
 
+import os
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -26,10 +27,9 @@ _MAX_BYTES = 1 << 16
 def begin_countdown(runtime_folder: Path, scan_id: str, label: str, ends_s: float) -> None:
     """Make a countdown known; ``ends_s`` in monotonic seconds."""
     folder = private_folder(runtime_folder / _FOLDER)
-    known = counting_down(runtime_folder)
+    # One console, and one countdown at a time: what is there was left by a console that was killed.
     for path in entries_of(folder):
-        if path.stem not in known:
-            path.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
     document = {"label": label, "ends_s": ends_s, "boot": boot_id()}
     write_json(folder / f"{scan_id}.json", document, durable=False)
 
@@ -44,8 +44,8 @@ def end_countdown(runtime_folder: Path, scan_id: str) -> bool:
 
 
 def is_counting_down(runtime_folder: Path, scan_id: str) -> bool:
-    """Whether nobody has ended the countdown of a scan."""
-    return (runtime_folder / _FOLDER / f"{scan_id}.json").exists()
+    """Whether nobody has ended the countdown of a scan, as far as the disk says."""
+    return os.path.lexists(runtime_folder / _FOLDER / f"{scan_id}.json")
 
 
 def counting_down(runtime_folder: Path) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import zmq
 from station.console.live.control import NotRunningError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
+from station.core.files import disk_words
 from station.core.scans import CANCELLED
 from station.messaging.asking import RefusedError
 from station.messaging.countdowns import begin_countdown, end_countdown, is_counting_down
@@ -44,6 +46,7 @@ class ScanCountdown:
 
         Raises:
             NotRunningError, RefusedError: as the station says; another countdown is running.
+            OSError: the disk has no room for what commands know of it; nothing was begun.
         """
         with self._lock:
             if scan_id in self._waiting:
@@ -84,7 +87,8 @@ class ScanCountdown:
         with self._lock:
             waiting = self._waiting.get(scan_id)
             if waiting is not None and waiting.state == "countdown":
-                end_countdown(self._folder, scan_id)
+                with suppress(OSError):  # it is not taken, whatever is left on the disk
+                    end_countdown(self._folder, scan_id)
                 self._end(scan_id, waiting, CANCELLED)
             if waiting is not None:
                 return self._document(scan_id)
@@ -107,7 +111,8 @@ class ScanCountdown:
                 command(self._config, Request("scan", scan_id, waiting.label))
             except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
                 # Whatever it is: a countdown that does not end keeps all other scans waiting.
-                self._end(scan_id, waiting, str(error))
+                words = disk_words(error) if isinstance(error, OSError) else str(error)
+                self._end(scan_id, waiting, words)
                 return
             del self._waiting[scan_id]
 

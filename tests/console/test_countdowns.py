@@ -1,0 +1,84 @@
+"""Scans in the console's countdown, as the API and commands know of them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from click.testing import CliRunner
+from live_console import LiveConsole, problem_of
+
+from station.archive.phrases import untranslated
+from station.booth.deletion import purge
+from station.booth.operator.sensors_cli import cancel
+from station.messaging.countdowns import begin_countdown, counting_down, end_countdown
+
+
+def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole) -> None:
+    """Whoever deleted it was told that there was no such scan, and then it was taken."""
+    with console.sensors(), console.client() as client:
+        scan = client.post("/scans", json={"label": "Order\u3000 8", "countdown_s": 20}).json()
+        try:
+            for path in (f"/scans/{scan['scan_id']}", "/scans?label=Order 8"):
+                told = problem_of(client.delete(path), 409, "not-possible")
+                assert "is being taken; try again when it is done" in told["detail"]
+            problem_of(client.delete("/scans?label=Order"), 404, "no-such-scan")
+        finally:
+            client.post(f"/scans/{scan['scan_id']}/cancel")
+        problem_of(client.delete("/scans?label=Order 8"), 404, "no-such-scan")
+
+
+def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
+    """They said that there was no such scan, and it was taken seconds later."""
+    option = ["--config", str(console.station.config)]
+    with console.sensors(), console.client() as client:
+        scan = client.post("/scans", json={"label": "Order 9", "countdown_s": 20}).json()
+        scan_id = scan["scan_id"]
+        for words in ([scan_id], ["--label", "Order\u3000 9"]):
+            told = str(CliRunner().invoke(purge, [*words, *option]).exception)
+            assert told == f"scan {scan_id} is being taken; try again when it is done"
+        assert "no scan with the label" in str(
+            CliRunner().invoke(purge, ["--label", "Order", *option]).exception
+        )
+        done = CliRunner().invoke(cancel, [scan_id, *option])
+        assert done.output == f"scan {scan_id}: cancelled by the operator\n", done.exception
+        found = console.wait_for(scan_id)
+        assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
+        assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
+    assert counting_down(console.config.runtime.folder) == {}
+
+
+def test_a_countdown_ends_though_its_disk_refuses(console: LiveConsole) -> None:
+    """A cancel was refused, and the reason was an error's own words."""
+    folder, aside = (console.config.runtime.folder / name for name in ("countdown", "aside"))
+    key = {"Idempotency-Key": "refused by the disk"}
+    with console.sensors(), console.client() as client:
+        for seconds in (20, 2):
+            scan = client.post("/scans", json={"label": "a", "countdown_s": seconds}).json()
+            folder.rename(aside)
+            folder.touch()
+            try:
+                if seconds > 2:
+                    cancelled = client.post(f"/scans/{scan['scan_id']}/cancel").json()
+                    assert cancelled["reasons"] == ["cancelled by the operator"]
+                    continue
+                [reason] = console.wait_for(scan["scan_id"])["reasons"]
+                assert reason.startswith("the disk cannot be written (Not a directory: ")
+                assert untranslated(reason) == ["Not a directory"]
+                order = {"label": "b", "countdown_s": 20}
+                problem_of(client.post("/scans", json=order, headers=key), 503, "disk")
+            finally:
+                folder.unlink()
+                aside.rename(folder)
+        # Nothing was begun, and the key may be another request's.
+        scan = client.post("/scans", json={**order, "label": "c"}, headers=key).json()
+        assert list(counting_down(console.config.runtime.folder).values()) == ["c"]
+        client.post(f"/scans/{scan['scan_id']}/cancel").raise_for_status()
+
+
+def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:
+    begin_countdown(tmp_path, "one", "Order 1", time.monotonic() - 60.0)
+    assert counting_down(tmp_path) == {}
+    begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
+    assert counting_down(tmp_path) == {"two": "Order 2"}
+    assert not end_countdown(tmp_path, "one")
