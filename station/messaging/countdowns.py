@@ -3,9 +3,11 @@
 The station gets the order when the countdown ends; until then the spool has nothing of the scan,
 and commands would not find it. So the console keeps a file in the runtime folder:
 
-    countdown/<scan id>.json   label, when the countdown ends
+    countdown/<scan id>.json        label, when the countdown ends
+    countdown/<scan id>.cancelled   nothing
 
-Whoever removes it, the console at the end or control for a cancel, decides if the scan is taken.
+Whoever takes the first away decides if the scan is taken: the console at the end, or the console or
+control for a cancel. The second tells the other that asks for the same.
 """
 
 from __future__ import annotations
@@ -31,30 +33,49 @@ def begin_countdown(runtime_folder: Path, scan_id: str, label: str, ends_s: floa
     for path in entries_of(folder):
         path.unlink(missing_ok=True)
     document = {"label": label, "ends_s": ends_s, "boot": boot_id()}
-    write_json(folder / f"{scan_id}.json", document, durable=False)
+    write_json(_path(runtime_folder, scan_id), document, durable=False)
 
 
 def end_countdown(runtime_folder: Path, scan_id: str) -> bool:
-    """End the countdown of a scan; whether it was running, and nobody else has ended it."""
+    """End the countdown of a scan that is to be taken; whether nobody has cancelled it."""
     try:
-        (runtime_folder / _FOLDER / f"{scan_id}.json").unlink()
+        _path(runtime_folder, scan_id).unlink()
     except FileNotFoundError:
         return False
     return True
 
 
+def cancel_countdown(runtime_folder: Path, scan_id: str) -> bool:
+    """Cancel a scan in its countdown; whether it is cancelled, now or before."""
+    path = _path(runtime_folder, scan_id)
+    cancelled = path.with_suffix(".cancelled")
+    try:
+        path.rename(cancelled)
+    except FileNotFoundError:
+        return os.path.lexists(cancelled)
+    with suppress(OSError):  # its label is kept no longer than needed
+        os.truncate(cancelled, 0)
+    return True
+
+
 def is_counting_down(runtime_folder: Path, scan_id: str) -> bool:
     """Whether nobody has ended the countdown of a scan, as far as the disk says."""
-    return os.path.lexists(runtime_folder / _FOLDER / f"{scan_id}.json")
+    return os.path.lexists(_path(runtime_folder, scan_id))
 
 
 def counting_down(runtime_folder: Path) -> dict[str, str]:
     """Scans whose countdown runs, with their labels."""
     found = {}
     for path in entries_of(runtime_folder / _FOLDER):
+        if path.suffix != ".json":
+            continue
         with suppress(OSError, ValueError, KeyError, TypeError):
             document = read_bounded_json(path, _MAX_BYTES)
             over_s = time.monotonic() - float(document["ends_s"])
             if document["boot"] == boot_id() and over_s < _LATE_S:
                 found[path.stem] = str(document["label"])
     return found
+
+
+def _path(runtime_folder: Path, scan_id: str) -> Path:
+    return runtime_folder / _FOLDER / f"{scan_id}.json"

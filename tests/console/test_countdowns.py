@@ -11,7 +11,12 @@ from live_console import LiveConsole, problem_of
 from station.archive.phrases import untranslated
 from station.booth.deletion import purge
 from station.booth.operator.sensors_cli import cancel
-from station.messaging.countdowns import begin_countdown, counting_down, end_countdown
+from station.messaging.countdowns import (
+    begin_countdown,
+    cancel_countdown,
+    counting_down,
+    end_countdown,
+)
 
 
 def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole) -> None:
@@ -40,8 +45,10 @@ def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
         assert "no scan with the label" in str(
             CliRunner().invoke(purge, ["--label", "Order", *option]).exception
         )
-        done = CliRunner().invoke(cancel, [scan_id, *option])
-        assert done.output == f"scan {scan_id}: cancelled by the operator\n", done.exception
+        # At the same moment as on the page, too.
+        for _ in range(2):
+            done = CliRunner().invoke(cancel, [scan_id, *option])
+            assert done.output == f"scan {scan_id}: cancelled by the operator\n", done.exception
         found = console.wait_for(scan_id)
         assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
         assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
@@ -82,3 +89,11 @@ def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:
     begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
     assert counting_down(tmp_path) == {"two": "Order 2"}
     assert not end_countdown(tmp_path, "one")
+    assert not cancel_countdown(tmp_path, "one")
+    assert cancel_countdown(tmp_path, "two")
+    assert cancel_countdown(tmp_path, "two")
+    assert not end_countdown(tmp_path, "two")
+    assert counting_down(tmp_path) == {}
+    begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
+    assert end_countdown(tmp_path, "two")
+    assert not cancel_countdown(tmp_path, "two")

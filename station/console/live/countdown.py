@@ -16,7 +16,12 @@ from station.core.config import BoothConfig
 from station.core.files import disk_words
 from station.core.scans import CANCELLED
 from station.messaging.asking import RefusedError
-from station.messaging.countdowns import begin_countdown, end_countdown, is_counting_down
+from station.messaging.countdowns import (
+    begin_countdown,
+    cancel_countdown,
+    end_countdown,
+    is_counting_down,
+)
 from station.messaging.messages import Request
 
 _KEPT = 100
@@ -88,7 +93,7 @@ class ScanCountdown:
             waiting = self._waiting.get(scan_id)
             if waiting is not None and waiting.state == "countdown":
                 with suppress(OSError):  # it is not taken, whatever is left on the disk
-                    end_countdown(self._folder, scan_id)
+                    cancel_countdown(self._folder, scan_id)
                 self._end(scan_id, waiting, CANCELLED)
             if waiting is not None:
                 return self._document(scan_id)
