@@ -29,7 +29,7 @@ _MAX_BYTES = 1 << 16
 def begin_countdown(runtime_folder: Path, scan_id: str, label: str, ends_s: float) -> None:
     """Make a countdown known; ``ends_s`` in monotonic seconds."""
     folder = private_folder(runtime_folder / _FOLDER)
-    # One console, and one countdown at a time: what is there was left by a console that was killed.
+    # One console, and one countdown at a time: what is there is over.
     for path in entries_of(folder):
         path.unlink(missing_ok=True)
     document = {"label": label, "ends_s": ends_s, "boot": boot_id()}
