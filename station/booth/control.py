@@ -56,7 +56,7 @@ from station.core.scans import (
 )
 from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
-from station.messaging.countdowns import cancel_countdown
+from station.messaging.countdowns import cancel_countdown, end_countdown
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
 from station.messaging.transport import ask, dealer, publisher, server, subscriber
@@ -175,6 +175,8 @@ class ControlProcess:
         scan_id = scan_id_of(request.scan_id)
         if (known := self._known(scan_id)) is not None:
             return Reply(ok=True, content=known)
+        if not end_countdown(self._folder, scan_id):
+            return Reply(ok=False, error=CANCELLED)
         label = plain_label(request.label)
         if len(label) > MAX_LABEL_LENGTH:
             return Reply(

@@ -6,8 +6,8 @@ and commands would not find it. So the console keeps a file in the runtime folde
     countdown/<scan id>.json        label, when the countdown ends
     countdown/<scan id>.cancelled   nothing
 
-Whoever takes the first away decides if the scan is taken: the console at the end, or the console or
-control for a cancel. The second tells the other that asks for the same.
+Control takes the first away when it gets the order. It refuses that of a scan that was cancelled
+before, which may be on its way already.
 """
 
 from __future__ import annotations
@@ -37,30 +37,26 @@ def begin_countdown(runtime_folder: Path, scan_id: str, label: str, ends_s: floa
 
 
 def end_countdown(runtime_folder: Path, scan_id: str) -> bool:
-    """End the countdown of a scan that is to be taken; whether nobody has cancelled it."""
-    try:
-        _path(runtime_folder, scan_id).unlink()
-    except FileNotFoundError:
-        return False
-    return True
+    """End the countdown, if it has one, of a scan that is ordered; whether nobody cancelled it."""
+    _path(runtime_folder, scan_id).unlink(missing_ok=True)
+    return not is_cancelled(runtime_folder, scan_id)
 
 
 def cancel_countdown(runtime_folder: Path, scan_id: str) -> bool:
     """Cancel a scan in its countdown; whether it is cancelled, now or before."""
-    path = _path(runtime_folder, scan_id)
-    cancelled = path.with_suffix(".cancelled")
+    path, cancelled = (_path(runtime_folder, scan_id, kind) for kind in ("json", "cancelled"))
     try:
         path.rename(cancelled)
     except FileNotFoundError:
-        return os.path.lexists(cancelled)
+        return is_cancelled(runtime_folder, scan_id)
     with suppress(OSError):  # its label is kept no longer than needed
         os.truncate(cancelled, 0)
     return True
 
 
-def is_counting_down(runtime_folder: Path, scan_id: str) -> bool:
-    """Whether nobody has ended the countdown of a scan, as far as the disk says."""
-    return os.path.lexists(_path(runtime_folder, scan_id))
+def is_cancelled(runtime_folder: Path, scan_id: str) -> bool:
+    """Whether a scan was cancelled in its countdown."""
+    return os.path.lexists(_path(runtime_folder, scan_id, "cancelled"))
 
 
 def counting_down(runtime_folder: Path) -> dict[str, str]:
@@ -77,5 +73,5 @@ def counting_down(runtime_folder: Path) -> dict[str, str]:
     return found
 
 
-def _path(runtime_folder: Path, scan_id: str) -> Path:
-    return runtime_folder / _FOLDER / f"{scan_id}.json"
+def _path(runtime_folder: Path, scan_id: str, kind: str = "json") -> Path:
+    return runtime_folder / _FOLDER / f"{scan_id}.{kind}"

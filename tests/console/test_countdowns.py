@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from click.testing import CliRunner
@@ -11,12 +14,14 @@ from live_console import LiveConsole, problem_of
 from station.archive.phrases import untranslated
 from station.booth.deletion import purge
 from station.booth.operator.sensors_cli import cancel
+from station.messaging.asking import command
 from station.messaging.countdowns import (
     begin_countdown,
     cancel_countdown,
     counting_down,
     end_countdown,
 )
+from station.messaging.messages import Request
 
 
 def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole) -> None:
@@ -55,6 +60,23 @@ def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
     assert counting_down(console.config.runtime.folder) == {}
 
 
+def test_a_cancel_is_carried_out_though_the_order_is_on_its_way(console: LiveConsole) -> None:
+    """Control, if it was late, said that there was no such scan, and then took it."""
+    [control] = console.station.pids("control")
+    with console.sensors(), console.client() as client, ThreadPoolExecutor() as pool:
+        scan = client.post("/scans", json={"label": "late", "countdown_s": 1}).json()
+        os.kill(control, signal.SIGSTOP)
+        try:
+            request = Request("cancel", scan["scan_id"])
+            answer = pool.submit(command, console.config, request)
+            time.sleep(1.5)
+        finally:
+            os.kill(control, signal.SIGCONT)
+        assert answer.result()["reason"] == "cancelled by the operator"
+        found = console.wait_for(scan["scan_id"])
+        assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
+
+
 def test_a_countdown_ends_though_its_disk_refuses(console: LiveConsole) -> None:
     """A cancel was refused, and the reason was an error's own words."""
     folder, aside = (console.config.runtime.folder / name for name in ("countdown", "aside"))
@@ -88,7 +110,7 @@ def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:
     assert counting_down(tmp_path) == {}
     begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
     assert counting_down(tmp_path) == {"two": "Order 2"}
-    assert not end_countdown(tmp_path, "one")
+    assert end_countdown(tmp_path, "one")
     assert not cancel_countdown(tmp_path, "one")
     assert cancel_countdown(tmp_path, "two")
     assert cancel_countdown(tmp_path, "two")

@@ -13,15 +13,9 @@ import zmq
 from station.console.live.control import NotRunningError, command
 from station.console.live.events import EventLog
 from station.core.config import BoothConfig
-from station.core.files import disk_words
 from station.core.scans import CANCELLED
 from station.messaging.asking import RefusedError
-from station.messaging.countdowns import (
-    begin_countdown,
-    cancel_countdown,
-    end_countdown,
-    is_counting_down,
-)
+from station.messaging.countdowns import begin_countdown, cancel_countdown, is_cancelled
 from station.messaging.messages import Request
 
 _KEPT = 100
@@ -110,14 +104,10 @@ class ScanCountdown:
             if waiting.state != "countdown":
                 return
             try:
-                if not end_countdown(self._folder, scan_id):
-                    self._end(scan_id, waiting, CANCELLED)
-                    return
                 command(self._config, Request("scan", scan_id, waiting.label))
             except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
                 # Whatever it is: a countdown that does not end keeps all other scans waiting.
-                words = disk_words(error) if isinstance(error, OSError) else str(error)
-                self._end(scan_id, waiting, words)
+                self._end(scan_id, waiting, str(error))
                 return
             del self._waiting[scan_id]
 
@@ -126,9 +116,9 @@ class ScanCountdown:
             waiting = self._waiting[scan_id]
             if waiting.state != "countdown":
                 return None
-            # A command may have cancelled it.
-            goes_on = is_counting_down(self._folder, scan_id)
-            return waiting.starts_s - time.monotonic() if goes_on else 0.0
+            if is_cancelled(self._folder, scan_id):
+                return 0.0  # by a command: control refuses the order, and says so
+            return waiting.starts_s - time.monotonic()
 
     def _end(self, scan_id: str, waiting: _Waiting, reason: str) -> None:
         waiting.state, waiting.reason = "failed", reason
