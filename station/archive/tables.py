@@ -82,7 +82,7 @@ def _remedy(folder: Path) -> str:
     kept = folder.parent.parent / "done" / folder.name
     if not (kept / "bundle.json").exists():
         return "scan again"
-    return f"scan again, or in the spool's folder: reconstruct fit done/{folder.name} --out result"
+    return f"scan again, or in the spool's folder: reconstruct fit done/{folder.name} --out FOLDER"
 
 
 def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[str, Any]]:
