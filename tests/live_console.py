@@ -35,6 +35,17 @@ def problem_status(answer: httpx.Response) -> int:
     return answer.status_code
 
 
+def problem_of(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
+    """The problem document that an answer has to be."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem: dict[str, Any] = answer.json()
+    assert problem["status"] == status
+    assert problem["type"] == f"/problems/{kind}"
+    assert problem["detail"]
+    return problem
+
+
 class LiveConsole:
     """A station with a console, a password and tokens of every scope.
 

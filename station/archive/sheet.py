@@ -162,11 +162,11 @@ def _cut(text: str, room: float, size: float, *, bold: bool = False) -> str:
 
 
 def _lines(reasons: str) -> list[str]:
-    """The head's lines of reasons, broken between words where there are any."""
+    """The head's lines of reasons, broken between words; Chinese has spaces only around numbers."""
     room, lines = _WIDTH - 2 * _MARGIN, list[str]()
     while len(lines) < _REASONS_LINES and (line := _cut(reasons, room, _REASONS_SIZE)):
         if line != reasons and len(lines) < _REASONS_LINES - 1:
-            end = reasons.rfind(" ", 1, len(line))
+            end = reasons.rfind(" ", len(line) // 2, len(line))
             line = reasons[: end if end > 0 else len(line) - 1]
         lines.append(line)
         reasons = reasons[len(line) :].lstrip()

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from station.archive.records import ScanRecord
-from station.core.errors import FormatError
-from station.core.files import MAX_JSON_BYTES, read_bounded_json
+from station.core.errors import DiskReadError, FormatError
+from station.core.files import MAX_JSON_BYTES, OF_THE_DISK, read_bounded_json
 from station.core.words.tables import FILES, Pose, rounded_differences
 from station.core.words.terms import Language, plain_name, split_side, verdict_words
 
@@ -37,15 +37,33 @@ _MARKS: dict[str, tuple[str, dict[Language, str]]] = {
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
+def read_of_result(path: Path) -> Any:
+    """A JSON document in a result's folder.
+
+    Raises:
+        DiskReadError: the disk refuses to read it.
+        OSError: it is not there.
+        ValueError: it is no JSON.
+    """
+    try:
+        return read_bounded_json(path, MAX_JSON_BYTES)
+    except OSError as error:
+        if error.errno not in OF_THE_DISK:
+            raise
+        words = f"{path.name} of {path.parent.name} cannot be read ({error.strerror})"
+        raise DiskReadError(f"{words}; check the spool's disk") from None
+
+
 def read_measurements(folder: Path, pose: Pose) -> dict[str, Any]:
     """A result's table as it lies in its folder.
 
     Raises:
         FormatError: it is missing, damaged or of another version.
+        DiskReadError: the disk refuses to read it.
     """
     path = folder / FILES[pose]
     try:
-        document = read_bounded_json(path, MAX_JSON_BYTES)
+        document = read_of_result(path)
     except OSError:
         raise FormatError(f"{folder.name} has no {path.name}; {_remedy(folder)}") from None
     except ValueError as cause:
@@ -64,7 +82,7 @@ def _remedy(folder: Path) -> str:
     kept = folder.parent.parent / "done" / folder.name
     if not (kept / "bundle.json").exists():
         return "scan again"
-    return f"scan again, or in the spool's folder: reconstruct fit done/{folder.name} --out result"
+    return f"scan again, or in the spool's folder: reconstruct fit done/{folder.name} --out FOLDER"
 
 
 def rows(document: dict[str, Any], unit: Unit, language: Language) -> list[dict[str, Any]]:

@@ -56,7 +56,7 @@ from station.core.scans import (
 )
 from station.core.service import Heartbeat, only_process, stop_event
 from station.core.spool import Spool
-from station.messaging.countdowns import end_countdown
+from station.messaging.countdowns import cancel_countdown, end_countdown
 from station.messaging.messages import DesiredState, Reply, Request, ScanEvent
 from station.messaging.topics import TOPICS
 from station.messaging.transport import ask, dealer, publisher, server, subscriber
@@ -175,6 +175,8 @@ class ControlProcess:
         scan_id = scan_id_of(request.scan_id)
         if (known := self._known(scan_id)) is not None:
             return Reply(ok=True, content=known)
+        if not end_countdown(self._folder, scan_id):
+            return Reply(ok=False, error=CANCELLED)
         label = plain_label(request.label)
         if len(label) > MAX_LABEL_LENGTH:
             return Reply(
@@ -215,7 +217,7 @@ class ControlProcess:
         """Cancel a scan in the console's countdown, being taken or waiting; a later one has a
         result, which can be purged."""
         scan_id = scan_id_of(request.scan_id)
-        if end_countdown(self._folder, scan_id):
+        if cancel_countdown(self._folder, scan_id):
             return Reply(ok=True, content=asdict(Session(scan_id, "", "failed", reason=CANCELLED)))
         status = self._scan_status(scan_id)
         if status["state"] == "failed":

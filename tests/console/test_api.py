@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -19,28 +18,14 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from live_console import API, LiveConsole
+from live_console import API, LiveConsole, problem_of
 
 from station.archive.surfaces import read_mesh
-from station.booth.deletion import purge
-from station.booth.operator.sensors_cli import cancel
 from station.console.security.vault import Vault
 from station.core.rig import Rig
 from station.handover.ledger import Ledger, Waiting
-from station.messaging.countdowns import begin_countdown, counting_down, end_countdown
 
 README = Path(__file__).parents[2] / "README.md"
-
-
-def _problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    problem: dict[str, Any] = answer.json()
-    assert problem["status"] == status
-    assert problem["type"] == f"/problems/{kind}"
-    assert problem["detail"]
-    return problem
 
 
 def test_a_scan_carries_its_order_to_every_export(
@@ -121,7 +106,7 @@ def test_the_same_key_never_scans_twice(console: LiveConsole, scans: list[dict[s
         found = client.get("/scans", params={"label": "twice"}).json()["scans"]
         assert len(found) == 1
         reused = client.post("/scans", json={"label": "other"}, headers={"Idempotency-Key": "k-1"})
-        _problem(reused, 422, "idempotency-key-reused")
+        problem_of(reused, 422, "idempotency-key-reused")
     assert scans
 
 
@@ -143,43 +128,9 @@ def test_a_countdown_can_be_cancelled(console: LiveConsole) -> None:
         assert scan["state"] == "countdown"
         assert not scan["may_leave"]
         busy = client.post("/scans", json={"label": "next", "countdown_s": 1})
-        assert "another scan" in _problem(busy, 409, "refused")["detail"]
+        assert "another scan" in problem_of(busy, 409, "refused")["detail"]
         gone = client.post(f"/scans/{scan['scan_id']}/cancel").json()
         assert (gone["state"], gone["reasons"]) == ("failed", ["cancelled by the operator"])
-
-
-def test_a_scan_in_its_countdown_is_not_said_to_be_missing(console: LiveConsole) -> None:
-    """Whoever deleted it was told that there was no such scan, and then it was taken."""
-    with console.sensors(), console.client() as client:
-        scan = client.post("/scans", json={"label": "Order\u3000 8", "countdown_s": 20}).json()
-        try:
-            for path in (f"/scans/{scan['scan_id']}", "/scans?label=Order 8"):
-                told = _problem(client.delete(path), 409, "not-possible")
-                assert "is being taken; try again when it is done" in told["detail"]
-            _problem(client.delete("/scans?label=Order"), 404, "no-such-scan")
-        finally:
-            client.post(f"/scans/{scan['scan_id']}/cancel")
-        _problem(client.delete("/scans?label=Order 8"), 404, "no-such-scan")
-
-
-def test_commands_know_a_scan_in_its_countdown(console: LiveConsole) -> None:
-    """They said that there was no such scan, and it was taken seconds later."""
-    option = ["--config", str(console.station.config)]
-    with console.sensors(), console.client() as client:
-        scan = client.post("/scans", json={"label": "Order 9", "countdown_s": 20}).json()
-        scan_id = scan["scan_id"]
-        for words in ([scan_id], ["--label", "Order\u3000 9"]):
-            told = str(CliRunner().invoke(purge, [*words, *option]).exception)
-            assert told == f"scan {scan_id} is being taken; try again when it is done"
-        assert "no scan with the label" in str(
-            CliRunner().invoke(purge, ["--label", "Order", *option]).exception
-        )
-        done = CliRunner().invoke(cancel, [scan_id, *option])
-        assert done.output == f"scan {scan_id}: cancelled by the operator\n", done.exception
-        found = console.wait_for(scan_id)
-        assert (found["state"], found["reasons"]) == ("failed", ["cancelled by the operator"])
-        assert "there is no scan" in str(CliRunner().invoke(purge, [scan_id, *option]).exception)
-    assert counting_down(console.config.runtime.folder) == {}
 
 
 def test_a_token_that_only_scans_follows_its_scan(console: LiveConsole) -> None:
@@ -194,23 +145,15 @@ def test_a_token_that_only_scans_follows_its_scan(console: LiveConsole) -> None:
         try:
             assert client.post("/scans", **order, headers=headers).json() == first
             asked = client.get(f"/scans/{first['scan_id']}", headers=headers)
-            assert "needs the scope read" in _problem(asked, 403, "not-allowed")["detail"]
-            _problem(client.post("/booth/hand-over", headers=headers), 403, "not-allowed")
+            assert "needs the scope read" in problem_of(asked, 403, "not-allowed")["detail"]
+            problem_of(client.post("/booth/hand-over", headers=headers), 403, "not-allowed")
             # Another one's key is another key.
             theirs = {**headers, "Authorization": f"Bearer {other}"}
-            _problem(client.post("/scans", **order, headers=theirs), 409, "refused")
+            problem_of(client.post("/scans", **order, headers=theirs), 409, "refused")
         finally:
             client.post(f"/scans/{first['scan_id']}/cancel", headers=headers)
         gone = client.post("/scans", **order, headers=headers).json()
         assert (gone["scan_id"], gone["state"]) == (first["scan_id"], "failed")
-
-
-def test_a_countdown_whose_console_ended_is_over(tmp_path: Path) -> None:
-    begin_countdown(tmp_path, "one", "Order 1", time.monotonic() - 60.0)
-    assert counting_down(tmp_path) == {}
-    begin_countdown(tmp_path, "two", "Order 2", time.monotonic() + 60.0)
-    assert counting_down(tmp_path) == {"two": "Order 2"}
-    assert not end_countdown(tmp_path, "one")
 
 
 def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) -> None:
@@ -225,8 +168,8 @@ def test_search_and_delete(console: LiveConsole, scans: list[dict[str, Any]]) ->
         told = client.delete(f"/scans/{done['scan_id']}").json()
         assert told == {"scans": [done["scan_id"]], "handed_over": ["shop"]}
         assert ledger.receivers(done["scan_id"]) == []
-        _problem(client.get(f"/scans/{done['scan_id']}"), 404, "no-such-scan")
-        _problem(client.delete("/scans", params={"label": "nobody"}), 404, "no-such-scan")
+        problem_of(client.get(f"/scans/{done['scan_id']}"), 404, "no-such-scan")
+        problem_of(client.delete("/scans", params={"label": "nobody"}), 404, "no-such-scan")
     log = (console.config.console.folder / "audit.log").read_text()
     entries = [json.loads(line) for line in log.splitlines()]
     deleted = [e for e in entries if e["what"] == "delete" and e["scan"] == done["scan_id"]]
@@ -249,7 +192,7 @@ def test_two_scans_are_compared(console: LiveConsole, scans: list[dict[str, Any]
         mesh = console.config.spool.folder / "outbox" / one / "mesh.ply"
         assert len(signed) == len(read_mesh(mesh).vertices)
         assert np.sqrt(np.mean(signed**2)) == pytest.approx(found["surface_rms_m"], rel=1e-3)
-        _problem(client.get(f"/scans/{one}/comparison/nobody"), 404, "no-such-scan")
+        problem_of(client.get(f"/scans/{one}/comparison/nobody"), 404, "no-such-scan")
 
 
 def test_events_are_resumed_where_they_stopped(
@@ -277,13 +220,13 @@ def test_events_are_resumed_where_they_stopped(
 
 def test_errors_say_what_the_commands_say(console: LiveConsole) -> None:
     with console.client() as client:
-        _problem(client.get("/scans/unknown-1"), 404, "no-such-scan")
-        _problem(client.get("/nothing"), 404, "not-found")
-        _problem(client.post("/scans", json={"labl": "x"}), 422, "invalid")
-        _problem(client.post("/scans", content=b"{"), 422, "invalid")
-        _problem(client.post("/task/answer", json={"answer": "go"}), 409, "refused")
-        _problem(client.put("/scans", json={}), 405, "method-not-allowed")
-        _problem(client.post("/calibrations/none/use"), 404, "no-such-calibration")
+        problem_of(client.get("/scans/unknown-1"), 404, "no-such-scan")
+        problem_of(client.get("/nothing"), 404, "not-found")
+        problem_of(client.post("/scans", json={"labl": "x"}), 422, "invalid")
+        problem_of(client.post("/scans", content=b"{"), 422, "invalid")
+        problem_of(client.post("/task/answer", json={"answer": "go"}), 409, "refused")
+        problem_of(client.put("/scans", json={}), 405, "method-not-allowed")
+        problem_of(client.post("/calibrations/none/use"), 404, "no-such-calibration")
 
 
 def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole) -> None:
@@ -295,7 +238,9 @@ def test_a_calibration_of_other_cameras_is_not_put_into_use(console: LiveConsole
     before = console.config.calibration.read_bytes()
     try:
         with console.client() as client:
-            problem = _problem(client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible")
+            problem = problem_of(
+                client.post(f"/calibrations/{entry.name}/use"), 409, "not-possible"
+            )
     finally:
         # Other tests share the booth, which has no stored calibration.
         shutil.rmtree(entry)

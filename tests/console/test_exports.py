@@ -198,6 +198,8 @@ def test_the_sheet_tells_all_reasons_or_that_there_are_more() -> None:
     for line in (*whole, last, *sheet._lines(chinese), *sheet._lines("i" * 100_000)):
         assert sheet._width(line, sheet._REASONS_SIZE) <= room
     assert sheet._lines("") == []
+    # A line ended after its first words, where nothing but a number has spaces.
+    assert len(sheet._lines("只看到 9 " + "左" * 150)[0]) > 60
 
 
 def test_the_sheet_of_a_body_without_a_neck_to_measure(

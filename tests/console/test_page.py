@@ -119,6 +119,11 @@ def test_a_scan_is_followed_by_a_page_that_is_loaded_anew(
     fresh.fill("#label", "anew")
     fresh.click("#go", timeout=LONG_MS)
     expect(fresh.locator("#stage h2")).to_have_text("anew", timeout=LONG_MS)
+    # A station that does not answer just then is asked again.
+    late = {"type": "/problems/station-not-running", "detail": "the station does not answer"}
+    fresh.route("**/scans/*", lambda route: route.fulfill(status=503, json=late), times=1)
+    fresh.reload()
+    expect(fresh.locator("#label")).to_be_visible(timeout=LONG_MS)
     fresh.reload()
     expect(fresh.locator("#stage h2")).to_have_text("anew", timeout=LONG_MS)
     expect(fresh.locator(".ring .number")).to_have_text(re.compile(r"\d"), timeout=LONG_MS)

@@ -6,21 +6,23 @@ import asyncio
 import errno
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 from fastapi import FastAPI
 from live_console import API
 
+from station.archive import tables
 from station.archive.phrases import untranslated
-from station.console.api import results
 from station.console.api.console import Console
 from station.console.api.problems import install
 from station.console.app import create_app
 from station.core.config_file import load_config
-from station.core.files import write_json
+from station.core.files import read_bounded_json, write_json
 from station.messaging.asking import RefusedError
 
 _RESULT = "20261121T100000Z-0001"
@@ -76,13 +78,33 @@ def test_nothing_is_told_of_a_result_whose_verdict_is_lost(
 def test_a_disk_that_refuses_is_not_said_to_have_damaged_a_result(
     parts: Console, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*_: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
+    """A table was "missing", and a new scan was asked for."""
+    write_json(parts.spool.path("outbox", _RESULT) / "measurements.json", _TABLE)
+    for what, name in (("files", "result.json"), ("measurements.csv", "measurements.json")):
 
-    monkeypatch.setattr(results, "read_bounded_json", refused)
-    told = _ask(parts, "GET", f"/scans/{_RESULT}/files").json()["detail"]
-    assert told.endswith("cannot be read (Input/output error); check the spool's disk")
-    assert untranslated(told) == []
+        def refused(path: Path, most: int, name: str = name) -> Any:
+            if path.name == name:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return read_bounded_json(path, most)
+
+        monkeypatch.setattr(tables, "read_bounded_json", refused)
+        told = _ask(parts, "GET", f"/scans/{_RESULT}/{what}").json()["detail"]
+        words = f"{name} of {_RESULT} cannot be read (Input/output error)"
+        assert told == f"{words}; check the spool's disk"
+        assert untranslated(told) == []
+
+
+def test_a_result_that_is_taken_away_at_this_moment_is_not_damaged(
+    parts: Console, monkeypatch: pytest.MonkeyPatch
+) -> None:
+
+    def taken(path: Path, most: int) -> Any:
+        shutil.rmtree(path.parent)
+        return read_bounded_json(path, most)
+
+    monkeypatch.setattr(tables, "read_bounded_json", taken)
+    answer = _ask(parts, "GET", f"/scans/{_RESULT}/measurements.csv")
+    assert (answer.status_code, answer.json()["type"]) == (404, "/problems/gone")
 
 
 @pytest.mark.parametrize("method", ["GET", "DELETE"])

@@ -19,10 +19,8 @@ from station.core.scans import CANCELLED
 STATIC = Path(__file__).parents[2] / "station/console/static"
 
 
-def _on_the_page(
-    tmp_path: Path, module: str, function: str, texts: Sequence[object], to: str
-) -> Any:
-    """Results of a function of the page's own scripts, run as they stand."""
+def _on_the_page(tmp_path: Path, module: str, call: str, texts: Sequence[object], to: str) -> Any:
+    """Values of an expression of each text, `it`, and the page's own scripts, as they stand."""
     script = tmp_path / "said.mjs"
     words, said = ((STATIC / "js" / name).as_uri() for name in ("i18n.js", module))
     script.write_text(
@@ -33,9 +31,9 @@ def _on_the_page(
         "globalThis.fetch = async (path) => ({ json: async () =>\n"
         "  path.includes('phrases') ? phrases : catalogue });\n"
         f"const {{ loadWords }} = await import({json.dumps(words)});\n"
-        f"const said = await import({json.dumps(said)});\n"
+        f"const page = await import({json.dumps(said)});\n"
         f"await loadWords('{to}');\n"
-        f"console.log(JSON.stringify({json.dumps(texts)}.map(said.{function})));\n"
+        f"console.log(JSON.stringify({json.dumps(texts)}.map((it) => {call})));\n"
     )
     done = run_node(
         [str(script)], return_completed_process=True, capture_output=True, text=True, check=False
@@ -46,13 +44,16 @@ def _on_the_page(
 
 
 def test_the_page_says_what_the_sheet_says(tmp_path: Path) -> None:
-    said = _on_the_page(tmp_path, "i18n.js", "said", SPOKEN, "zh")
+    said = _on_the_page(tmp_path, "i18n.js", "page.said(it)", SPOKEN, "zh")
     assert said == [in_language(text, "zh") for text in SPOKEN]
 
 
 def test_the_page_knows_a_cancelled_scan(tmp_path: Path) -> None:
     scans = [{"state": "failed", "reasons": [why]} for why in (CANCELLED, "the booth is empty")]
-    assert _on_the_page(tmp_path, "i18n.js", "outcome", scans, "en") == ["cancelled", "failed"]
+    assert _on_the_page(tmp_path, "i18n.js", "page.outcome(it)", scans, "en") == [
+        "cancelled",
+        "failed",
+    ]
 
 
 def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
@@ -64,7 +65,7 @@ def test_the_page_tells_what_is_wrong_with_the_booth(tmp_path: Path) -> None:
     states = [well, {**well, "problems": problems}, {**well, "running": False}]
     states += [{**well, "problems": [*late, *problems]}, {**well, "problems": late[:1]}]
     states += [{**well, "remarks": problems}, {**well, "remarks": problems, "disk_free_mb": 1}]
-    said = _on_the_page(tmp_path, "troubles.js", "troubles", states, "zh")
+    said = _on_the_page(tmp_path, "troubles.js", "page.troubles(it)", states, "zh")
     calibrate = "扫描室尚未校准，不能扫描：请运行 “校准”"
     assert said[:2] == [[], [in_language(problems[0], "zh"), calibrate]]
     assert said[2] == ["扫描站没有响应："]
@@ -87,12 +88,13 @@ def test_commands_are_buttons_and_the_sentence_stays_whole(tmp_path: Path) -> No
         "station calibrate ballast": "“All remaining steps” ballast",
         "with station calibrate --use 20261120T100000Z": "with “Use” 20261120T100000Z",
     }
-    said = _on_the_page(tmp_path, "remedies.js", "withButtons", list(texts), "en")
+    said = _on_the_page(tmp_path, "remedies.js", "page.withButtons(it)", list(texts), "en")
     assert said == list(texts.values())
 
 
 def test_commands_are_buttons_and_views_wherever_there_are_some(tmp_path: Path) -> None:
-    """A camera that had moved was to be checked in a terminal, by whoever has but a tablet."""
+    """A camera that had moved was to be checked in a terminal, by whoever has but a tablet; and
+    what the API refuses names requests."""
     texts = {
         "put the camera back and run station check, or run station calibrate": "put the camera "
         "back and run “Check now”, or run “Calibrate”",
@@ -100,9 +102,19 @@ def test_commands_are_buttons_and_views_wherever_there_are_some(tmp_path: Path) 
         "with station calibrate --use 20261120T100000Z (--list shows all)": "with station "
         "calibrate --use 20261120T100000Z (--list shows all)",
         "run station calibrate mark": "run station calibrate mark",
+        "the sensors are stopped; run station start first": "the sensors are stopped; run “Switch "
+        "sensors on” first",
+        "or run: station purge --old": "or run: station purge --old",
+        "if it stays silent, see station status": "if it stays silent, see “Booth”",
+        "repair it, see GET /api/v1/booth": "repair it, see “Booth”",
+        "see GET /api/v1/scans": "see “History”",
+        "delete it with: DELETE /api/v1/scans/20261121T100000Z-7f3a": "delete it with: “Delete”",
     }
-    said = _on_the_page(tmp_path, "remedies.js", "withViews", list(texts), "en")
+    said = _on_the_page(tmp_path, "remedies.js", "page.withViews(it)", list(texts), "en")
     assert said == list(texts.values())
+    refused = {"detail": "the sensors are stopped; switch them on with POST /api/v1/booth/start"}
+    told = _on_the_page(tmp_path, "api.js", "new page.Problem(409, it).message", [refused], "zh")
+    assert told == ["传感器已关闭；请用 “打开传感器” 打开"]
 
 
 @pytest.mark.parametrize("step", ["floor", "ball", "stand", "depth", "solve"])

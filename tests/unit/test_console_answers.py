@@ -25,7 +25,7 @@ from station.simulation.scene import default_rig
             503,
             "No space left on device: /spool",
         ),
-        (PermissionError(13, "Permission denied", "/spool/x"), 503, "see station status"),
+        (PermissionError(13, "Permission denied", "/spool/x"), 503, "see GET /api/v1/booth"),
     ],
 )
 def test_an_error_of_the_disk_is_a_problem_document(

@@ -73,7 +73,7 @@ def test_a_result_whose_table_is_damaged_is_an_error(tmp_path: Path) -> None:
     for folder in (result, bundle):
         folder.mkdir(parents=True)
     table = result / "measurements.json"
-    again = "in the spool's folder: reconstruct fit done/one --out result"
+    again = "in the spool's folder: reconstruct fit done/one --out FOLDER"
     for text, words in (
         (None, "one has no measurements.json"),
         ("{", "measurements.json of one is damaged"),

@@ -34,6 +34,7 @@ class Problem(BaseModel):
 _REMEDIES = (
     (re.compile("run station start first"), "switch them on with POST /api/v1/booth/start"),
     (re.compile("see station list"), "see GET /api/v1/scans"),
+    (re.compile("repair it, see station status"), "repair it, see GET /api/v1/booth"),
     (re.compile(r"with: station purge (\S+)"), r"with: DELETE /api/v1/scans/\1"),
 )
 """Commands that a refusal names, and the requests that do the same."""

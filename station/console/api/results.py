@@ -17,13 +17,19 @@ from station.archive.compare import compare_rows, compare_surfaces
 from station.archive.records import ScanRecord
 from station.archive.sheet import sheet_pdf
 from station.archive.smis import smis
-from station.archive.tables import Unit, csv_table, read_measurements, rows, side_differences
+from station.archive.tables import (
+    Unit,
+    csv_table,
+    read_measurements,
+    read_of_result,
+    rows,
+    side_differences,
+)
 from station.console.api.console import Booth, Caller, Console, Reader, ScanId
 from station.console.api.models import Comparison, File, Measurements, Part, Quality
 from station.console.api.problems import ProblemError, responses
 from station.console.api.scans import of_record
-from station.core.errors import DiskReadError, FormatError
-from station.core.files import MAX_JSON_BYTES, OF_THE_DISK, read_bounded_json
+from station.core.errors import FormatError
 from station.core.words.tables import Pose
 from station.core.words.terms import Language, part_in_words
 
@@ -289,14 +295,13 @@ def _result(folder: Path) -> dict[str, Any]:
     Raises:
         FormatError: it is missing, damaged or without a verdict.
         DiskReadError: the disk refuses to read it.
+        FileNotFoundError: the result was taken away at this moment.
     """
     document = None
     try:
-        document = read_bounded_json(folder / "result.json", MAX_JSON_BYTES)
-    except OSError as error:
-        if error.errno in OF_THE_DISK:
-            words = f"the result of {folder.name} cannot be read ({error.strerror})"
-            raise DiskReadError(f"{words}; check the spool's disk") from None
+        document = read_of_result(folder / "result.json")
+    except OSError:
+        folder.stat()  # or the result was taken away, which damages nothing
     except ValueError:
         pass
     if not isinstance(document, dict) or document.get("status") not in ("ok", "rescan"):

@@ -95,7 +95,7 @@ def take(body: NewScan, console: Booth, caller: Scanner, key: IdempotencyKey = N
     console.audit.note(caller.name, caller.address, "scan", scan_id)
     try:
         return _of_session(console.countdown.begin(scan_id, body.label, body.countdown_s))
-    except RefusedError:
+    except (RefusedError, OSError):
         # Nothing was begun: the same request may be sent again when the reason is gone.
         if key is not None:
             console.vault.forget(key_of(caller.name, key))

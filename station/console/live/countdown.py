@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from station.console.live.events import EventLog
 from station.core.config import BoothConfig
 from station.core.scans import CANCELLED
 from station.messaging.asking import RefusedError
-from station.messaging.countdowns import begin_countdown, end_countdown, is_counting_down
+from station.messaging.countdowns import begin_countdown, cancel_countdown, is_cancelled
 from station.messaging.messages import Request
 
 _KEPT = 100
@@ -44,6 +45,7 @@ class ScanCountdown:
 
         Raises:
             NotRunningError, RefusedError: as the station says; another countdown is running.
+            OSError: the disk has no room for what commands know of it; nothing was begun.
         """
         with self._lock:
             if scan_id in self._waiting:
@@ -84,7 +86,8 @@ class ScanCountdown:
         with self._lock:
             waiting = self._waiting.get(scan_id)
             if waiting is not None and waiting.state == "countdown":
-                end_countdown(self._folder, scan_id)
+                with suppress(OSError):  # it is not taken, whatever is left on the disk
+                    cancel_countdown(self._folder, scan_id)
                 self._end(scan_id, waiting, CANCELLED)
             if waiting is not None:
                 return self._document(scan_id)
@@ -101,9 +104,6 @@ class ScanCountdown:
             if waiting.state != "countdown":
                 return
             try:
-                if not end_countdown(self._folder, scan_id):
-                    self._end(scan_id, waiting, CANCELLED)
-                    return
                 command(self._config, Request("scan", scan_id, waiting.label))
             except (NotRunningError, RefusedError, OSError, zmq.ZMQError) as error:
                 # Whatever it is: a countdown that does not end keeps all other scans waiting.
@@ -116,9 +116,9 @@ class ScanCountdown:
             waiting = self._waiting[scan_id]
             if waiting.state != "countdown":
                 return None
-            # A command may have cancelled it.
-            goes_on = is_counting_down(self._folder, scan_id)
-            return waiting.starts_s - time.monotonic() if goes_on else 0.0
+            if is_cancelled(self._folder, scan_id):
+                return 0.0  # by a command: control refuses the order, and says so
+            return waiting.starts_s - time.monotonic()
 
     def _end(self, scan_id: str, waiting: _Waiting, reason: str) -> None:
         waiting.state, waiting.reason = "failed", reason

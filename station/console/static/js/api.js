@@ -1,6 +1,7 @@
 // Requests to the API; a problem document becomes an Error with its words.
 
-import { said, t } from './i18n.js';
+import { t } from './i18n.js';
+import { withViews as said } from './remedies.js';
 
 const PREFIX = '/api/v1';
 

@@ -3,8 +3,9 @@
 import { get } from './api.js';
 import { h } from './dom.js';
 import { isLost, listen } from './events.js';
-import { said, t } from './i18n.js';
+import { t } from './i18n.js';
 import { Pictures } from './pictures.js';
+import { withViews as said } from './remedies.js';
 
 const LOOKS = { streaming: 'good', opening: 'warn', lost: 'bad', dead: 'bad', off: '' };
 

@@ -13,9 +13,17 @@ export function withButtons(text) {
   });
 }
 
-// In the other views: with a step or an option, a command is the terminal's.
-const ELSEWHERE = /station (check|calibrate)(?! ?-| [a-z(])/g;
+// In the other views: what the station calls a command, and the API a request, is a button or a view.
+// With a step or an option, a command is the terminal's.
+const ELSEWHERE = {
+  'booth.start': /station start\b|POST \/api\/v1\/booth\/start/g,
+  'booth.checkNow': /station check(?! ?-| [a-z(])/g,
+  'nav.calibration': /station calibrate(?! ?-| [a-z(])/g,
+  'nav.booth': /station status\b|GET \/api\/v1\/booth/g,
+  'nav.history': /GET \/api\/v1\/scans/g,
+  'history.delete': /DELETE \/api\/v1\/scans\/[\w-]+/g,
+};
 
 export function withViews(text) {
-  return said(text).replace(ELSEWHERE, (_, word) => t('cal.button', { name: t(word === 'check' ? 'booth.checkNow' : 'nav.calibration') }));
+  return Object.entries(ELSEWHERE).reduce((told, [key, words]) => told.replace(words, () => t('cal.button', { name: t(key) })), said(text));
 }

@@ -34,7 +34,10 @@ async function remembered() {
   let scanId = null;
   try { scanId = sessionStorage.getItem(UNDERWAY); } catch { /* as above */ }
   if (!scanId) return null;
-  const current = await get(`/scans/${scanId}`).catch(() => null);
+  const current = await get(`/scans/${scanId}`).catch((error) => {
+    // Anything else may be over when the view is opened again.
+    if (error.kind === 'no-such-scan') remember(null);
+  });
   return current && { label: current.label, pressed: null, took: null, current, asking: null };
 }
 
@@ -74,7 +77,6 @@ export async function scan(main, session) {
 
   function ready() {
     current = null;
-    remember(null);
     clearInterval(timer);
     const input = h('input', { type: 'text', id: 'label', value: label, maxLength: session.label_length,
       placeholder: t('scan.placeholder'), autocomplete: 'off', enterKeyHint: 'go',
@@ -159,6 +161,7 @@ export async function scan(main, session) {
 
   function deleted() {
     notice(t('scan.deleted'));
+    remember(null);
     ready();
   }
 
