@@ -78,6 +78,17 @@ def test_what_bodies_have_is_no_clothing(model: BodyModel) -> None:
         assert signs_of(model, np.asarray(thicker)) == []
 
 
+def test_what_hangs_down_to_the_crotch_is_one_sign(model: BodyModel) -> None:
+    """A belly over the tops of the thighs was a sign of the trunk and one of the legs."""
+    height = model.mean[:, 2]
+    trunk = model.of_parts((*TRUNK, "thigh_left", "thigh_right"))
+    low = height[model.landmarks["crotch"]]
+    found = signs_of(model, np.where(trunk & (height > low), 0.012, 0.0))
+    assert [sign.at for sign in found] == ["pelvis", "pelvis"]
+    assert "thigh_left" in found[1].covered
+    assert not is_worn(found, [])
+
+
 @pytest.mark.parametrize("press_m", [0.003, 0.008])
 def test_a_band_that_presses_into_flesh_is_no_clothing(model: BodyModel, press_m: float) -> None:
     """Briefs, a bra and grippers of cycling shorts, with the flesh above and below them."""

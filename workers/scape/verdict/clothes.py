@@ -227,8 +227,11 @@ def _hem(model: BodyModel, limb: Limb, column: _Column, level: int, step_m: floa
     chain = _LIMBS[limb]
     before = chain[: chain.index(stem) + 1] if stem in chain else ()
     covered = tuple(f"{name}_{side}" for name in before for side in _SIDES)
+    above_crotch = level * _BIN_M < column.along_m[model.landmarks["crotch"]]
+    # Vests end there, and bellies; the part with most of the skin may be the thigh.
+    at = "pelvis" if stem == "thigh" and above_crotch else stem
     thickness_m = min(_THICKNESS_TO_STEP * step_m, _THICKEST_M)
-    return Clothing(stem, covered, thickness_m, is_sure=limb == "arm" and step_m > _SLEEVE_M)
+    return Clothing(at, covered, thickness_m, is_sure=limb == "arm" and step_m > _SLEEVE_M)
 
 
 def is_worn(signs: Sequence[Clothing], lost: Collection[str]) -> bool:
