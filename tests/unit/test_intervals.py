@@ -15,7 +15,7 @@ from workers.measure.intervals import (
 )
 from workers.measure.scan_errors import ScanErrors, cover_sigma_m
 from workers.scape.model.body_model import BodyModel
-from workers.scape.model.deformation import vertex_normals
+from workers.scape.model.deformation import vertex_areas, vertex_normals
 
 
 def test_the_intervals_belong_to_the_model(model: BodyModel) -> None:
@@ -99,7 +99,7 @@ def test_the_calibrations_own_errors_widen_volume_and_surface(model: BodyModel) 
 def test_hair_around_a_head_widens_what_it_makes_larger(model: BodyModel) -> None:
     """Two centimetres: 2 pi of them to the head's girth, one to the stature, none to the waist."""
     sigma = np.zeros(model.vertex_count)
-    covered = ScanErrors(cover_sigma_m=cover_sigma_m(model, {("head",): 0.02}))
+    covered = ScanErrors(cover_sigma_m=cover_sigma_m(model, [(("head",), 0.02)]))
     usual, wider = (
         {
             row.name: 0.5 * float(np.diff(row.interval95_m)[0])
@@ -111,6 +111,24 @@ def test_hair_around_a_head_widens_what_it_makes_larger(model: BodyModel) -> Non
     assert added["head_girth"] == pytest.approx(2.0 * np.pi * 0.02, rel=0.05)
     assert added["height"] == pytest.approx(0.02, rel=0.05)
     assert added["waist_girth"] == 0.0
+
+
+def test_the_thickest_cover_counts_and_widens_both_contents(model: BodyModel) -> None:
+    """One sign of clothing replaced another that may hide the same parts."""
+    hips, whole = ("pelvis", "thigh_left"), model.part_names
+    sigma = cover_sigma_m(model, [(hips, 0.03), (hips, 0.02), (("head",), 0.0)])
+    assert sigma is not None
+    assert sigma.max() == pytest.approx(0.03 / 1.96)
+    assert cover_sigma_m(model, [(hips, 0.0)]) is None
+    areas = vertex_areas(model.mean, model.faces)
+    skin, cover = (
+        errors.of_contents(0.07, areas, 1.75)
+        for errors in (
+            ScanErrors(girth_sigma_m=2.0 * np.pi * 1e-3),
+            ScanErrors(cover_sigma_m=cover_sigma_m(model, [(whole, 1.96e-3)])),
+        )
+    )
+    assert (cover.volume, cover.surface) == pytest.approx((skin.volume, skin.surface))
 
 
 def test_an_interval_holds_its_value() -> None:

@@ -12,6 +12,7 @@ from workers.cloud.observed import RAISED_FLOOR, TWO_PEOPLE, Finding, PointCloud
 from workers.scape.evidence.inside import shares_inside
 from workers.scape.model.body_model import FLOOR, BodyModel
 from workers.scape.model.deformation import vertex_normals
+from workers.scape.verdict.clothes import Clothing
 from workers.scape.verdict.hair import hair_of
 from workers.scape.verdict.posture import arms_inside, feet_cut_off, head_turned, leaning
 from workers.scape.verdict.seen import PartReport
@@ -80,6 +81,21 @@ def _verdict(  # type: ignore[no-untyped-def]
 ):
     sides, beta = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count)
     return judge((), sides, (), lost, 1.75, beta, shifts, 1e-3, misplaced or {})
+
+
+def test_what_clothing_may_explain_is_told_with_a_rescan(model: BodyModel) -> None:
+    """A belly that hangs is no clothing, but who wears a vest has to be told."""
+    hips = Clothing("pelvis", ("pelvis", "abdomen", "thigh_left"), 0.03)
+    sides, beta, lost = {"front": 0.9, "back": 0.9}, np.zeros(model.beta_count), {"abdomen": "lost"}
+    found = judge((), sides, (), lost, 1.75, beta, {}, 1e-3, {}, ["hair"], [hips])
+    assert (found.status, found.reasons) == ("rescan", ("lost",))
+    assert [note[:22] for note in found.notes] == ["clothing may lie up to"]
+    assert found.missing == ("abdomen",)
+    arms = Clothing("upper_arm", ("abdomen", "upper_arm_left"), 0.03)
+    worn = judge((), sides, (), lost, 1.75, beta, {}, 1e-3, {}, ["hair"], [hips, arms])
+    assert [reason[:14] for reason in worn.reasons] == ["loose clothing"]
+    assert worn.notes == ()
+    assert set(worn.missing) == {*hips.covered, *arms.covered}
 
 
 def test_a_lost_forearm_is_named_with_its_size(model: BodyModel) -> None:

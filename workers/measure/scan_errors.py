@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,12 +54,12 @@ class ScanErrors:
         moved_m = self.girth_sigma_m / (2.0 * np.pi)
         stretched = self.height_sigma_m / height_m
         thicker = float(vertex_areas_m2.sum()) * moved_m / volume_m3
-        cover_m3 = (
-            0.0 if self.cover_sigma_m is None else float(vertex_areas_m2 @ self.cover_sigma_m)
-        )
+        covered = 0.0
+        if self.cover_sigma_m is not None:
+            covered = float(vertex_areas_m2 @ self.cover_sigma_m) / volume_m3
         return Contents(
-            float(np.linalg.norm((thicker, stretched, cover_m3 / volume_m3))),
-            float(np.hypot(0.5 * thicker, stretched)),
+            float(np.linalg.norm((thicker, stretched, covered))),
+            float(np.linalg.norm((0.5 * thicker, stretched, 0.5 * covered))),
         )
 
     def of(self, definition: Definition) -> float:
@@ -93,13 +93,13 @@ def line_sigma(trace: Trace, vertex_sigma_m: Array) -> float:
     return float(np.sqrt(np.mean(along**2)))
 
 
-def cover_sigma_m(model: BodyModel, covers: Mapping[tuple[str, ...], float]) -> Array | None:
+def cover_sigma_m(model: BodyModel, covers: Iterable[tuple[Sequence[str], float]]) -> Array | None:
     """Standard deviations (P,) of the skin under covers; None where there is none.
 
     Args:
-        covers: parts that are covered -> thickness at most (95 %), metres.
+        covers: parts that are covered, each time with the thickness at most (95 %), metres.
     """
     thickness_m = np.zeros(model.vertex_count)
-    for parts, at_most_m in covers.items():
+    for parts, at_most_m in covers:
         thickness_m = np.maximum(thickness_m, np.where(model.of_parts(parts), at_most_m, 0.0))
     return thickness_m / NORMAL_QUANTILE if thickness_m.any() else None

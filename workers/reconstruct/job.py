@@ -220,8 +220,8 @@ def scan_errors(
         patch_sigma_m(model, fit.patches.result()),
         hidden_head_sigma(model, fit.surface.seen, fit.crown_sigma_m),
     )
-    covers = {sign.covered: sign.thickness_m for sign in fit.clothing.result()}
-    covers[("head",)] = fit.head_cover_m
+    covers = [(sign.covered, sign.thickness_m) for sign in fit.clothing.result()]
+    covers.append((("head",), fit.head_cover_m))
     errors = ScanErrors(
         crown_sigma_m=fit.crown_sigma_m,
         excess_noise_m=fit.cloud.excess_noise_m,

@@ -31,7 +31,7 @@ from workers.scape.model.deformation import vertex_normals
 from workers.scape.model.halves import started
 from workers.scape.surface.displacement import SurfaceFit, fit_surface
 from workers.scape.surface.intersections import untangled
-from workers.scape.verdict.clothes import Clothing, clothing_remarks, clothing_signs, is_worn
+from workers.scape.verdict.clothes import Clothing, clothing_signs
 from workers.scape.verdict.hair import Hair, hair_of, head_cover_m
 from workers.scape.verdict.posture import (
     arms_inside,
@@ -247,13 +247,11 @@ def separate_limbs(
     # What lies beside the head may be an arm that was not found.
     hair = Hair() if arms else hair_of(model, patches, fit.surface.vertices, fit.cloud)
     lost = lost_parts(model, patches, hair)
-    signs = fit.clothing.result()
-    worn = signs if is_worn(signs, lost) else ()
-    remarks = [*hair_remarks(hair, fit.head_cover_m), *clothing_remarks(signs)]
+    remarks, signs = hair_remarks(hair, fit.head_cover_m), fit.clothing.result()
     sides = sides_seen(model, vertices, surface.seen)
     stature_m, beta, shifts = np.ptp(vertices[:, 2]), fit.state.beta, fit.camera_shifts_m
     verdict = judge(
-        parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced, remarks, worn
+        parts, sides, noticed, lost, stature_m, beta, shifts, rms_m, misplaced, remarks, signs
     )
     delivered = _rounded(vertices)
     observer("done", {"vertices": delivered})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from station.core.words.terms import part_in_words
 from workers.cloud.observed import OFF_FLOOR, TWO_PEOPLE, Finding
 from workers.scape.model.body_model import FLOOR, HAND, BodyModel
-from workers.scape.verdict.clothes import Clothing, clothing_reasons
+from workers.scape.verdict.clothes import (
+    Clothing,
+    clothing_reasons,
+    clothing_remarks,
+    is_worn,
+)
 from workers.scape.verdict.hair import Hair
 from workers.scape.verdict.seen import TRUNK, PartReport, named_parts
 from workers.scape.verdict.seen_words import little_seen, many_hardly_seen
@@ -118,14 +123,15 @@ def judge(
         camera_shifts_m: how far the fit moved each camera's points; empty for a bare cloud.
         rms_m: distance of the points from the surface.
         misplaced: what `head_turned`, `arms_inside`, `feet_cut_off` and `head_cut_off` give.
-        remarks: on hair and clothing; told with a scan that can be used.
-        clothing: signs of clothing that hides the body, and explains what does not match there.
+        remarks: on hair; told with a scan that can be used.
+        clothing: its signs; where they are enough, it explains what does not match there.
     """
     cameras = bool(camera_shifts_m)
     unseen = _unseen_parts(parts, cameras=cameras)
     moved, of_cameras = _moved_cameras(camera_shifts_m)
     halves = _unseen_sides(sides, cameras=cameras)
-    hidden = dict.fromkeys(part for sign in clothing for part in sign.covered)
+    worn, doubtful = (clothing, ()) if is_worn(clothing, lost) else ((), clothing)
+    hidden = [part for sign in worn for part in sign.covered]
     lost = {part: reason for part, reason in lost.items() if part not in hidden}
     everywhere = _limbs_lost(lost) > 1
     lost = {**misplaced, **lost}
@@ -133,9 +139,8 @@ def judge(
     # A person without feet or head is short for that reason, which comes first.
     cut = stature_m < _STATURES_M[0] and any(part.startswith(_UPRIGHT) for part in (*lost, *unseen))
     reasons = [finding.message for finding in findings] + moved + ([] if cut else stature)
-    reasons += [*_nobody(beta), *clothing_reasons(clothing)]
-    if everywhere:
-        reasons.append(_NO_BODY if cameras else f"{_NO_BODY}; {_ON_ITS_HEAD}")
+    reasons += [*_nobody(beta), *clothing_reasons(worn)]
+    reasons += [_NO_BODY if cameras else f"{_NO_BODY}; {_ON_ITS_HEAD}"] if everywhere else []
     # What lies beside a body whose arm or head was not found may be that.
     told = [reason for part, reason in lost.items() if part or not misplaced]
     reasons += [*halves, *told[:_PARTS_NAMED]]
@@ -149,11 +154,11 @@ def judge(
         reasons = [finding.message for finding in findings]
     reasons = reasons or _scattered(rms_m, cameras=cameras)
     again = bool(reasons)
-    notes = of_cameras if again else [*remarks, *of_cameras]
+    notes = [*([] if again else remarks), *clothing_remarks(doubtful), *of_cameras]
     missing = _missing(
-        parts, findings, lost, unseen, halves, hidden, cameras=cameras, again=again,
-        everywhere=everywhere,
-    )  # fmt: skip
+        parts, findings, lost, unseen, halves, cameras=cameras, again=again, everywhere=everywhere
+    )
+    missing = tuple(dict.fromkeys((*missing, *hidden)))
     return Verdict("rescan" if again else "ok", tuple(reasons), tuple(notes), missing)
 
 
@@ -281,7 +286,6 @@ def _missing(
     lost: Mapping[str, str],
     unseen: Mapping[str, str],
     halves: Sequence[str],
-    hidden: Iterable[str],
     *,
     cameras: bool,
     again: bool,
@@ -293,7 +297,6 @@ def _missing(
         lost: reasons by the part that does not match the scan or was misplaced.
         unseen: what `_unseen_parts` gives.
         halves: what `_unseen_sides` gives.
-        hidden: parts that clothing hides.
         again: the scan is to be taken again.
         everywhere: the body was fitted to something else.
     """
@@ -311,7 +314,7 @@ def _missing(
         missing += [
             part.name for part in parts if part.name in TRUNK or part.coverage < _HALF_COVERAGE
         ]
-    return tuple(dict.fromkeys((*missing, *hidden)))
+    return tuple(dict.fromkeys(missing))
 
 
 def _with_rest_of_limbs(
