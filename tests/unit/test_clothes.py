@@ -117,6 +117,14 @@ def test_hips_are_compared_with_what_was_seen(model: BodyModel) -> None:
     assert "pelvis" not in [sign.at for sign in found]
 
 
+def test_an_edge_around_both_arms_above_bare_hips_is_flesh(model: BodyModel) -> None:
+    """Muscles and lipoedema have edges of 4 to 5 mm there."""
+    cuffs = np.where(sleeve(model, "left") | sleeve(model, "right"), 0.006, 0.0)
+    assert signs_of(model, cuffs) == []
+    shirt = np.where(model.of_parts(("pelvis",)), 0.008, cuffs)
+    assert [sign.at for sign in signs_of(model, shirt) if sign.at == "upper_arm"] == ["upper_arm"]
+
+
 def test_cloth_that_hangs_over_the_hips_may_be_clothing(model: BodyModel) -> None:
     """It has no edge, but folds that no other part has."""
     height, ahead = model.mean[:, 2], model.mean[:, 1]

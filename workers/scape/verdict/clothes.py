@@ -4,7 +4,7 @@ The model follows cloth as it follows skin: a T-shirt makes a heavier person, wh
 by 5 to 20 cm. What few bodies have is the edge where cloth ends: a step to the skin below it, most
 of the way around, at the same level on the left and on the right. Beside a band that presses into
 flesh the skin comes out again; below cloth it does not. And where cloth hangs over the hips, the
-model follows them far worse than the rest of the body.
+model follows them far worse than the head.
 
 Heavy flesh of trunk and legs can hang over an edge all around, too. One sign there is therefore a
 remark; a sleeve's edge, or signs at two of arms, legs and trunk, are a reason to scan again.
@@ -60,11 +60,9 @@ _REGIONS = (
     *((f"{part}_left", f"{part}_right") for part in ("upper_arm", "forearm", "thigh", "shin")),
 )  # fmt: skip
 """Parts whose misfits are compared: the hips, then the head, which is bare."""
-_HIPS_M, _HIPS_TO_REST = 0.0055, 2.2
-"""Misfit of the hips from which there may be clothing, and relative to the median region from which
-it may hang over them: dressed hips have 6.4 mm and more in 36 scans, bare ones at most 4.6."""
-_ALL_OVER_M = 0.007
-"""Misfit of the median region from which clothing may hang all over: bare bodies have 3.5 mm."""
+_HIPS_M, _HIPS_TO_HEAD = 0.0055, 3.5
+"""Misfit of the hips, also relative to the head's, from which clothing may hang over them: of 36
+dressed people 6.4 mm and 3.8 times and more, of bare ones at most 4.6 mm."""
 _TO_HEAD = 2.5
 """Misfit, relative to the head's, from which a region is covered too if anything is."""
 _THICKNESS_TO_STEP, _THICKNESS_TO_MISFIT = 6.0, 2.5
@@ -130,11 +128,13 @@ def clothing_signs(
         for part in parts
         if misfit_m > _TO_HEAD * misfits_m[1]
     ]
+    # A shirt hangs over the hips, too: without that, an edge around both arms is muscles or flesh.
+    bare_hips = misfits_m[0] < _HIPS_M
     signs = [*_loose_hips(misfits_m), *_hems(model, reference, normals, rotations, cloud)]
     return [
         replace(sign, covered=tuple(dict.fromkeys((*TRUNK, *sign.covered, *loose))))
         for sign in signs
-        if sign.is_sure or not misfits_m[0] < _HIPS_M
+        if sign.is_sure or not (bare_hips and sign.at in _LIMBS["arm"])
     ]
 
 
@@ -151,12 +151,9 @@ def _misfits(model: BodyModel, moved_m: Array, seen: Mask) -> Array:
 
 
 def _loose_hips(misfits_m: Array) -> list[Clothing]:
-    """Hips that the model follows far worse than the rest of the body, or with it very badly."""
-    hips_m = float(misfits_m[0])
-    if not hips_m > _HIPS_M:
-        return []
-    rest_m = float(np.nanmedian(misfits_m))
-    if _HIPS_TO_REST * rest_m > hips_m and rest_m < _ALL_OVER_M:
+    """Hips that the model follows far worse than the head."""
+    hips_m, head_m = (float(misfit_m) for misfit_m in misfits_m[:2])
+    if not hips_m > _HIPS_M or hips_m < _HIPS_TO_HEAD * head_m:
         return []
     thighs = ("thigh_left", "thigh_right")
     return [Clothing("pelvis", thighs, min(_THICKNESS_TO_MISFIT * hips_m, _THICKEST_M))]
