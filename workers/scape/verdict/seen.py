@@ -95,6 +95,7 @@ def unexplained_share(model: BodyModel, vertices: Array, cloud: PointCloud) -> f
 
 
 def thinned(cloud: PointCloud, count: int) -> tuple[Array, Array]:
+    """About so many points (n, 3) of a cloud, evenly chosen, and their normals."""
     every = slice(None, None, max(1, len(cloud.points) // count))
     return cloud.points[every], cloud.normals[every]
 

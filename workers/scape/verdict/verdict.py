@@ -163,13 +163,13 @@ def judge(
 
 
 def _nobody(beta: Array) -> list[str]:
-    if float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) < _MAX_BETA:
+    if not float(np.abs(beta[:_JUDGED_COMPONENTS]).max(initial=0.0)) > _MAX_BETA:
         return []
     return ["what stands in the booth does not look like a person"]
 
 
 def _scattered(rms_m: float, *, cameras: bool) -> list[str]:
-    if rms_m < _SCATTER_M:
+    if not rms_m > _SCATTER_M:  # where there are no readings it is not a number
         return []
     remedy = "run: station check" if cameras else "clean the cloud, or scan again"
     return [f"the readings lie {1e3 * rms_m:.0f} mm from the body; {remedy}"]
